@@ -1,0 +1,30 @@
+"""How an algorithm tells its caller how far it is, and how the caller stops it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """One step of one stage.
+
+    Attributes:
+        stage: name of the stage, as in the configuration and the report.
+        done_count, total_count: units of work; total_count is 0 while it is unknown.
+        fraction: share of the whole job that is done, 0 to 1.
+    """
+
+    stage: str
+    done_count: int
+    total_count: int
+    fraction: float
+
+
+# Called often and cheaply; raises `Cancelled` to stop the algorithm.
+ProgressCallback = Callable[[Progress], None]
+
+
+def ignore(progress: Progress) -> None:
+    """Let the algorithm run; nobody is watching."""
