@@ -1,0 +1,1 @@
+"""Client of the RoEL map server, and the `roel` command line."""

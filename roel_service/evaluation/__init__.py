@@ -1,0 +1,1 @@
+"""Maps and poses against the truth: the figures that every comparison reports."""

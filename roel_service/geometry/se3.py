@@ -7,7 +7,7 @@ R <- Exp(r) R and t <- t + d. Solvers, covariances and information matrices shar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast, overload
+from typing import Any, cast, overload
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -62,9 +62,9 @@ class SE3:
     def __len__(self) -> int:
         return int(self.translation.shape[0])
 
-    def __getitem__(self, index: object) -> SE3:
-        """Index the batch axes."""
-        return SE3(rotation=self.rotation[index], translation=self.translation[index])  # type: ignore[index]
+    def __getitem__(self, index: Any) -> SE3:
+        """Index the batch axes, as NumPy does."""
+        return SE3(rotation=self.rotation[index], translation=self.translation[index])
 
     @overload
     def __matmul__(self, other: SE3) -> SE3: ...

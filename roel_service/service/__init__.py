@@ -1,0 +1,1 @@
+"""The gRPC front: decode, call, encode. It never computes and never loads an algorithm."""
