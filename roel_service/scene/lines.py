@@ -26,8 +26,8 @@ class LineObservations:
         polarity: (M,) int8, -1 or +1; 0 where the two polarities were not told apart.
         normal_speed_px_per_ms: (M,) speed along the left-hand normal (-dy, dx) of the segment.
         event_offsets: (M + 1,) int64.
-        event_xy_px: (P, 2).
-        event_t_us: (P,) int64.
+        event_xy_px: (P, 2) float32, at each event's own time (no motion compensation).
+        event_dt_us: (P,) int32, time of each event minus the time of its frame.
     """
 
     frame: Array
@@ -35,20 +35,20 @@ class LineObservations:
     polarity: Array
     normal_speed_px_per_ms: FloatArray
     event_offsets: IntArray
-    event_xy_px: FloatArray
-    event_t_us: IntArray
+    event_xy_px: Array
+    event_dt_us: Array
 
     def __post_init__(self) -> None:
         count = len(self.frame)
-        events = len(self.event_t_us)
+        events = len(self.event_dt_us)
         for name, dtype, shape in (
             ("frame", np.int32, (count,)),
             ("segments_px", np.float64, (count, 2, 2)),
             ("polarity", np.int8, (count,)),
             ("normal_speed_px_per_ms", np.float64, (count,)),
             ("event_offsets", np.int64, (count + 1,)),
-            ("event_xy_px", np.float64, (events, 2)),
-            ("event_t_us", np.int64, (events,)),
+            ("event_xy_px", np.float32, (events, 2)),
+            ("event_dt_us", np.int32, (events,)),
         ):
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype, shape, name))
 

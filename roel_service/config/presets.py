@@ -1,0 +1,50 @@
+"""Named sets of parameters."""
+
+from __future__ import annotations
+
+from roel_service.config.stages import (
+    Config,
+    DetectConfig,
+    FramesConfig,
+    MatchGlobalConfig,
+    MatchLocalConfig,
+    PlaneFitConfig,
+    RefineConfig,
+    TriangulateConfig,
+    TrimConfig,
+)
+from roel_service.errors import ConfigError
+
+# Published values and choices; what the paper leaves open is marked in docs/paper_map.md.
+PAPER = Config(
+    frames=FramesConfig(compensate_rotation=False),
+    detect=DetectConfig(
+        representations=("binary", "timestamp"), merge_distance_px=2.0, merge_overlap=0.0
+    ),
+    plane_fit=PlaneFitConfig(
+        method="ransac",
+        candidate_distance_px=10.0,
+        time_scale_px_per_ms=20.0,
+        inlier_distance_px=2.0,
+        support_event_count=100,
+        support_half_window_us=25_000,
+    ),
+    match_local=MatchLocalConfig(
+        predict=False, max_distance_px=5.0, min_overlap=0.0, reach_frame_count=1
+    ),
+    match_global=MatchGlobalConfig(method="sampled"),
+    triangulate=TriangulateConfig(gate="grassmann", min_inlier_count=10, merge=True),
+    refine=RefineConfig(
+        residual="grassmann", loss="squared", event_weight=1e4, event_count_per_line=50
+    ),
+    trim=TrimConfig(method="cluster"),
+)
+
+PRESETS = {"default": Config(), "paper": PAPER}
+
+
+def preset(name: str) -> Config:
+    """The preset of that name; raises `ConfigError` for an unknown one."""
+    if name not in PRESETS:
+        raise ConfigError("preset", "one of " + ", ".join(PRESETS), name)
+    return PRESETS[name]

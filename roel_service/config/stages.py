@@ -1,0 +1,335 @@
+"""One dataclass for each TOML table; field names and units are the same everywhere.
+
+The paper's parameters and their readings are listed in `docs/paper_map.md`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+from roel_service.errors import ConfigError
+
+DETECTORS = ("edlines", "lsd")
+REPRESENTATIONS = ("binary", "timestamp", "count", "count_sum")
+PLANE_FIT_METHODS = ("vote", "ransac")
+MATCH_GLOBAL_METHODS = ("reassociate", "sampled")
+TRIANGULATE_GATES = ("pixel", "grassmann")
+REFINE_RESIDUALS = ("pixel", "grassmann")
+REFINE_LOSSES = ("cauchy", "squared")
+TRIM_METHODS = ("coverage", "cluster")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a value must satisfy, and how to say so."""
+
+    expected: str
+    holds: Callable[[Any], bool]
+
+
+POSITIVE = Rule("> 0", lambda value: value > 0)
+NOT_NEGATIVE = Rule(">= 0", lambda value: value >= 0)
+SHARE = Rule("in [0, 1]", lambda value: 0 <= value <= 1)
+AT_LEAST_TWO = Rule(">= 2", lambda value: value >= 2)
+ALL_POSITIVE = Rule("positive values", lambda values: all(value > 0 for value in values))
+SOME_POSITIVE = Rule(
+    "at least one value, all positive",
+    lambda values: len(values) > 0 and all(value > 0 for value in values),
+)
+
+
+def one_of(names: tuple[str, ...]) -> Rule:
+    """The value is one of these names."""
+    return Rule("one of " + ", ".join(names), lambda value: value in names)
+
+
+def some_of(names: tuple[str, ...]) -> Rule:
+    """Every value is one of these names, and there is at least one."""
+    expected = "at least one of " + ", ".join(names)
+    return Rule(expected, lambda values: len(values) > 0 and all(v in names for v in values))
+
+
+def parameter(default: Any, rule: Rule) -> Any:
+    """A field with its default and its range."""
+    return field(default=default, metadata={"rule": rule})
+
+
+class Stage:
+    """Base of the tables: checks every field's rule, and names the table in errors."""
+
+    table: str
+
+    def __init_subclass__(cls, *, table: str) -> None:
+        cls.table = table
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            value = getattr(self, item.name)
+            rule = item.metadata.get("rule")
+            finite = not isinstance(value, float) or math.isfinite(value)
+            if rule is not None and not (finite and rule.holds(value)):
+                path = f"{self.table}.{item.name}"
+                raise ConfigError(path, rule.expected, repr(value))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesConfig(Stage, table="frames"):
+    """When lines are looked for, and how events are brought to that time.
+
+    Attributes:
+        rate_hz: frames a second.
+        compensate_rotation: undo the camera's rotation within a frame, by the poses.
+        slot_us: events of one slot share one pose.
+        min_half_window_us, max_half_window_us: bounds of every window around a frame's time.
+    """
+
+    rate_hz: float = parameter(30.0, POSITIVE)
+    compensate_rotation: bool = True
+    slot_us: int = parameter(500, POSITIVE)
+    min_half_window_us: int = parameter(6_000, POSITIVE)
+    max_half_window_us: int = parameter(25_000, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectConfig(Stage, table="detect"):
+    """Multi-window, multi-representation line detection.
+
+    Attributes:
+        detector: 2D line detector.
+        representations: images made of every window; `timestamp` and `count` are one a polarity.
+        window_events_per_pixel: window sizes, in events for each pixel of the sensor.
+        window_event_counts: window sizes in events; takes the place of the former if not empty.
+        blur_px: standard deviation of the Gaussian that images are smoothed with.
+        gradient_threshold, anchor_threshold: of EDLines, in grey values.
+        line_fit_error_px: largest distance of an edge chain from its line.
+        min_length_px, min_length_width_share: shortest line, the larger of px and share of width.
+        merge_distance_px, merge_overlap: a line closer than this (perpendicular) to a longer one
+            over at least this share of its length is the same line.
+    """
+
+    detector: str = parameter("edlines", one_of(DETECTORS))
+    representations: tuple[str, ...] = parameter(("count_sum",), some_of(REPRESENTATIONS))
+    window_events_per_pixel: tuple[float, ...] = parameter((0.1, 0.3), SOME_POSITIVE)
+    window_event_counts: tuple[int, ...] = parameter((), ALL_POSITIVE)
+    blur_px: float = parameter(1.0, NOT_NEGATIVE)
+    gradient_threshold: int = parameter(12, POSITIVE)
+    anchor_threshold: int = parameter(4, NOT_NEGATIVE)
+    line_fit_error_px: float = parameter(1.2, POSITIVE)
+    min_length_px: float = parameter(10.0, POSITIVE)
+    min_length_width_share: float = parameter(0.0219, SHARE)
+    merge_distance_px: float = parameter(1.0, NOT_NEGATIVE)
+    merge_overlap: float = parameter(0.8, SHARE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneFitConfig(Stage, table="plane_fit"):
+    """Space-time planes through the events near each detected line.
+
+    Attributes:
+        method: `vote` (speed vote, then robust least squares) or `ransac` (the paper's).
+        candidate_distance_px: events this close to the detected line are candidates.
+        extension_px: candidates may lie this far beyond the ends (`vote`).
+        time_scale_px_per_ms: length of a millisecond in the paper's plane distance (`ransac`).
+        trial_count: random planes a line (`ransac`).
+        inlier_distance_px: a candidate this close to the plane supports it.
+        min_inlier_count: fewer supporting events give no line.
+        max_speed_widths_per_s, speed_count: range and steps of the vote on the normal speed.
+        support_bin_px, max_gap_bin_count: the supported run of the line, in bins with few gaps.
+        min_occupancy: share of the run's bins that hold events.
+        min_density_ratio: density of events on the line against beside it.
+        duplicate_distance_px, duplicate_overlap: of two fits this close, the better one stays.
+        support_event_count: supporting events kept a line, nearest in time to the frame.
+        support_half_window_us: supporting events are no farther in time from the frame.
+    """
+
+    method: str = parameter("vote", one_of(PLANE_FIT_METHODS))
+    candidate_distance_px: float = parameter(5.0, POSITIVE)
+    extension_px: float = parameter(24.0, NOT_NEGATIVE)
+    time_scale_px_per_ms: float = parameter(20.0, POSITIVE)
+    trial_count: int = parameter(64, POSITIVE)
+    inlier_distance_px: float = parameter(0.8, POSITIVE)
+    min_inlier_count: int = parameter(10, POSITIVE)
+    max_speed_widths_per_s: float = parameter(0.5625, POSITIVE)
+    speed_count: int = parameter(25, AT_LEAST_TWO)
+    support_bin_px: float = parameter(3.0, POSITIVE)
+    max_gap_bin_count: int = parameter(3, NOT_NEGATIVE)
+    min_occupancy: float = parameter(0.6, SHARE)
+    min_density_ratio: float = parameter(1.6, NOT_NEGATIVE)
+    duplicate_distance_px: float = parameter(1.3, NOT_NEGATIVE)
+    duplicate_overlap: float = parameter(0.6, SHARE)
+    support_event_count: int = parameter(400, POSITIVE)
+    support_half_window_us: int = parameter(12_000, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchLocalConfig(Stage, table="match_local"):
+    """Mutual nearest lines of neighbouring frames.
+
+    Attributes:
+        predict: move a line by its speed and the camera's rotation before comparing.
+        max_distance_px: largest distance between the lines.
+        min_overlap: share of the shorter line that must face the other.
+        reach_frame_count: a track stays open for this many frames without a line.
+    """
+
+    predict: bool = True
+    max_distance_px: float = parameter(2.5, POSITIVE)
+    min_overlap: float = parameter(0.3, SHARE)
+    reach_frame_count: int = parameter(3, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchGlobalConfig(Stage, table="match_global"):
+    """Lines of distant frames: by sampled frame pairs, or by projecting triangulated lines.
+
+    Attributes:
+        method: `sampled` joins tracks that correspond in sampled frames (the paper's scheme);
+            `reassociate` projects triangulated lines into every frame, in rounds.
+        frame_stride, neighbor_count: every how many frames, and against how many others, nearest
+            by camera centre (`sampled`).
+        min_epipolar_score: epipolar intersection over union of a correspondence (`sampled`).
+        max_distances_px: distance of an observation from the projected line, one value a round;
+            the first one serves `sampled`.
+        min_overlap: share of an observation that must face the projected line.
+        max_speed_difference_px_per_ms: observed against predicted normal speed.
+        max_shared_fraction: of two lines that share more observations, the weaker one goes.
+    """
+
+    method: str = parameter("reassociate", one_of(MATCH_GLOBAL_METHODS))
+    frame_stride: int = parameter(5, POSITIVE)
+    neighbor_count: int = parameter(20, POSITIVE)
+    min_epipolar_score: float = parameter(0.3, SHARE)
+    max_distances_px: tuple[float, ...] = parameter((1.5, 1.3, 1.1), SOME_POSITIVE)
+    min_overlap: float = parameter(0.3, SHARE)
+    max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
+    max_shared_fraction: float = parameter(0.9, SHARE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TriangulateConfig(Stage, table="triangulate"):
+    """RANSAC over pairs of views, and merging of duplicates.
+
+    Attributes:
+        gate: inliers by `pixel` distance, or by the `grassmann` angle and four segment distances.
+        min_observation_count: shorter tracks are not tried.
+        pair_count, scored_observation_count: hypotheses a track, and observations they meet.
+        min_plane_angle_deg: smallest angle between the two viewing planes of a hypothesis.
+        max_residual_px: of an inlier's ends (`pixel`).
+        max_grassmann_angle_deg: principal angle between viewing plane and line (`grassmann`).
+        max_angle_3d_deg, max_angle_2d_deg, max_perpendicular_px, max_perspective: the segment
+            distances of the paper's reference [LIMAP] (`grassmann`).
+        min_inlier_count: fewer inliers give no line.
+        merge: cluster lines by DBSCAN and keep the longest of each cluster.
+        merge_angle_deg, merge_disparity_px, merge_center_px: what counts as one in each part of
+            the clustering space.
+    """
+
+    gate: str = parameter("pixel", one_of(TRIANGULATE_GATES))
+    min_observation_count: int = parameter(3, AT_LEAST_TWO)
+    pair_count: int = parameter(60, POSITIVE)
+    scored_observation_count: int = parameter(40, AT_LEAST_TWO)
+    min_plane_angle_deg: float = parameter(0.4, POSITIVE)
+    max_residual_px: float = parameter(2.5, POSITIVE)
+    max_grassmann_angle_deg: float = parameter(1.4, POSITIVE)
+    max_angle_3d_deg: float = parameter(10.0, POSITIVE)
+    max_angle_2d_deg: float = parameter(5.0, POSITIVE)
+    max_perpendicular_px: float = parameter(2.0, POSITIVE)
+    max_perspective: float = parameter(0.015, POSITIVE)
+    min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+    merge: bool = False
+    merge_angle_deg: float = parameter(2.0, POSITIVE)
+    merge_disparity_px: float = parameter(2.0, POSITIVE)
+    merge_center_px: float = parameter(20.0, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineConfig(Stage, table="refine"):
+    """Joint least squares over the line term and the event term.
+
+    Attributes:
+        residual: `pixel` (both terms as angles times focal length) or `grassmann` (as published).
+        loss: robust loss of an observation, or none.
+        loss_scale_px: residual at which the loss starts to bend.
+        event_weight: weight of the event term against the line term; its unit follows `residual`.
+        event_count_per_line: supporting events used an observation, nearest in time; 0 uses all.
+        max_length_weight_px: observations longer than this weigh no more.
+        iteration_count: Gauss-Newton steps at the most.
+        max_residual_px: observations beyond it are left out of the next step.
+        min_inlier_count: a line with fewer has diverged.
+    """
+
+    residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
+    loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
+    loss_scale_px: float = parameter(0.7, POSITIVE)
+    event_weight: float = parameter(1.0, NOT_NEGATIVE)
+    event_count_per_line: int = parameter(0, NOT_NEGATIVE)
+    max_length_weight_px: float = parameter(60.0, POSITIVE)
+    iteration_count: int = parameter(8, POSITIVE)
+    max_residual_px: float = parameter(2.0, POSITIVE)
+    min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrimConfig(Stage, table="trim"):
+    """Infinite lines cut to the segments that were seen, and lines that cannot be trusted.
+
+    Attributes:
+        method: `coverage` (runs seen by enough frames, gaps stay gaps) or `cluster` (two ends
+            from clustered candidates, as published).
+        bin_m, max_gap_m, min_length_m: resolution, bridged gap and shortest run (`coverage`).
+        min_pixel_gap_px: gaps below this many pixels at the viewing distance are bridged too.
+        min_coverage_count, min_coverage_fraction: frames that must have seen a bin, absolute and
+            against the best bin.
+        end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
+        max_sigma_m: largest standard deviation of an end across the line.
+        max_rms_px: largest residual of a line.
+        min_support_ratio: frames that saw the line against frames that could have.
+        min_frame_count: frames that saw the line.
+        overlap_distance_m, overlap_angle_deg: parts this close to a stronger line are cut away.
+    """
+
+    method: str = parameter("coverage", one_of(TRIM_METHODS))
+    bin_m: float = parameter(0.004, POSITIVE)
+    max_gap_m: float = parameter(0.03, NOT_NEGATIVE)
+    min_length_m: float = parameter(0.03, NOT_NEGATIVE)
+    min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)
+    min_coverage_count: int = parameter(4, POSITIVE)
+    min_coverage_fraction: float = parameter(0.25, SHARE)
+    end_cluster_px: float = parameter(5.0, POSITIVE)
+    max_sigma_m: float = parameter(0.1, POSITIVE)
+    max_rms_px: float = parameter(0.65, POSITIVE)
+    min_support_ratio: float = parameter(0.4, SHARE)
+    min_frame_count: int = parameter(8, POSITIVE)
+    overlap_distance_m: float = parameter(0.012, NOT_NEGATIVE)
+    overlap_angle_deg: float = parameter(4.0, NOT_NEGATIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuntimeConfig(Stage, table="runtime"):
+    """How the work is done; nothing but speed depends on it, except for the seed.
+
+    Attributes:
+        seed: fixes all randomness.
+        worker_count: threads of the front end; 0 takes one a core.
+    """
+
+    seed: int = parameter(0, NOT_NEGATIVE)
+    worker_count: int = parameter(0, NOT_NEGATIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config:
+    """Every parameter of a run, one attribute for each TOML table."""
+
+    frames: FramesConfig = FramesConfig()
+    detect: DetectConfig = DetectConfig()
+    plane_fit: PlaneFitConfig = PlaneFitConfig()
+    match_local: MatchLocalConfig = MatchLocalConfig()
+    match_global: MatchGlobalConfig = MatchGlobalConfig()
+    triangulate: TriangulateConfig = TriangulateConfig()
+    refine: RefineConfig = RefineConfig()
+    trim: TrimConfig = TrimConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
