@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.errors import CameraError
+from roel_service.geometry.projection import CameraModel
 
-
-class CameraModel(Enum):
-    """How rays bend before they meet the image."""
-
-    PINHOLE = "pinhole"
-    FISHEYE = "fisheye"
-
+__all__ = ["DISTORTION_COUNTS", "Camera", "CameraModel", "Equirectangular"]
 
 # Coefficient counts that OpenCV defines: radial-tangential k1 k2 p1 p2 [k3 [k4 k5 k6]], and the
 # equidistant model's k1..k4.
