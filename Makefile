@@ -1,0 +1,55 @@
+# demo and test need nothing but make, Python 3.11 or newer, and a network for pip: they set up
+# .venv themselves, once for every state of pyproject.toml.
+
+PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(shell command -v $(name))))
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.PHONY: demo test check stubs-are-current no-large-files format proto bench serve
+
+demo: $(INSTALLED)  ## simulate a room, map it, show what came out
+	rm -rf demo-out
+	$(BIN)/roel demo --out demo-out
+
+test: check  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
+	$(BIN)/pytest $(PYTEST_ARGS)
+
+check: $(INSTALLED) stubs-are-current no-large-files  ## all that can be said without running the code
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/buf lint proto
+	$(BIN)/hadolint Dockerfile
+
+format: $(INSTALLED)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+proto: $(INSTALLED)  ## write the committed stubs of proto/ anew
+	$(BIN)/python proto/generate.py
+
+bench: $(INSTALLED)  ## seconds and figures of each stage on simulated rooms
+	$(BIN)/python bench/rooms.py
+
+serve: $(INSTALLED)
+	$(BIN)/roel serve --data $(or $(DATA),.roel-data)
+
+stubs-are-current: $(INSTALLED)
+	@before=$$(mktemp -d) && trap 'rm -rf "$$before"' EXIT && cp -R roel_service/v1/. "$$before" \
+	  && $(BIN)/python proto/generate.py \
+	  && diff -r -x __pycache__ "$$before" roel_service/v1 \
+	  || { echo "roel_service/v1 was not what proto/ generates; it is now: look and commit" >&2; exit 1; }
+
+no-large-files:
+	@! git ls-files -z | xargs -0 -I{} find {} -size +1000k | grep . \
+	  || { echo "the files above are over 1 MB; generated data stays out of git" >&2; exit 1; }
+
+$(INSTALLED): pyproject.toml .ci/system_libraries
+	@$(or $(PYTHON),false) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null \
+	  || { echo "Python 3.11 or newer is needed; name it with: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	.ci/system_libraries
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "Installing into .venv; the first time takes some minutes."
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
