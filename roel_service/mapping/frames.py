@@ -1,0 +1,299 @@
+"""Event frames at regular times: windows of events, brought to the frame's time, as images.
+
+Paper: "Multi-window, Multi-representation Line Detection"; frames are made at fixed intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.config.stages import DetectConfig, FramesConfig
+from roel_service.geometry import projection
+from roel_service.geometry.se3 import SE3
+from roel_service.mapping import frames_kernels
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventSlice, EventSource, EventStream, concatenate
+from roel_service.scene.trajectory import Trajectory
+
+# Polarity label of an image in which both polarities are drawn.
+UNKNOWN_POLARITY = 0
+# A count image saturates where a pixel holds this many times its 75th percentile: 1 - exp(-1.2).
+COUNT_GAIN = 1.2
+# Pixels with less than this many (spread) events do not count for that percentile.
+MIN_COUNT = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frames:
+    """Times and poses of all frames, in ideal pinhole pixels.
+
+    Attributes:
+        t_us: (N,) int64, increasing.
+        T_world_camera: (N) poses.
+        K: (3, 3) calibration matrix, px.
+        width, height: px.
+    """
+
+    t_us: IntArray
+    T_world_camera: SE3
+    K: FloatArray
+    width: int
+    height: int
+
+    def __len__(self) -> int:
+        return len(self.t_us)
+
+    @property
+    def focal_px(self) -> float:
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EventFrame:
+    """The events around one time.
+
+    Attributes:
+        events: the largest window, as views of the columns; t_ref_us is the frame's time.
+        ideal_px: (K, 2) float32, undistorted, at each event's own time.
+        compensated_px: (K, 2) float32, with the camera's rotation undone.
+        windows: for each configured window its half-open range of `events`, smallest first.
+        width, height: px.
+    """
+
+    events: EventSlice
+    ideal_px: Array
+    compensated_px: Array
+    windows: tuple[tuple[int, int], ...]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EventImage:
+    """One representation of one window.
+
+    Attributes:
+        grey: (H, W) uint8.
+        polarity: -1 or +1, or `UNKNOWN_POLARITY` where both are drawn.
+    """
+
+    grey: Array
+    polarity: int
+
+
+def frame_slices(
+    source: EventSource, trajectory: Trajectory, config: FramesConfig
+) -> Iterator[tuple[int, EventStream]]:
+    """Frame times with the events around each, read once and front to back.
+
+    A frame needs poses over its whole longest window; times without them are passed over. Memory
+    holds one chunk of the source and one window, however long the recording is.
+
+    Yields:
+        (t_us, events within `max_half_window_us` of it).
+    """
+    interval_us = round(1e6 / config.rate_hz)
+    reach_us = config.max_half_window_us
+    buffer: EventStream | None = None
+    t_us = None
+    for chunk in source.chunks():
+        if len(chunk) == 0:
+            continue
+        if t_us is None:
+            t_us = max(int(chunk.t_us[0]), int(trajectory.t_us[0])) + reach_us
+        buffer = _extended(buffer, chunk, keep_from_us=t_us - reach_us)
+        while t_us + reach_us <= buffer.t_us[-1]:
+            if trajectory.covers(np.array([t_us - reach_us, t_us, t_us + reach_us])).all():
+                yield t_us, buffer
+            t_us += interval_us
+
+
+def _extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: int) -> EventStream:
+    if buffer is None:
+        return chunk
+    kept = buffer.between(keep_from_us, int(buffer.t_us[-1]) + 1)
+    tail = EventStream(
+        t_us=kept.t_us,
+        x=kept.x,
+        y=kept.y,
+        polarity=kept.polarity,
+        width=chunk.width,
+        height=chunk.height,
+    )
+    return concatenate([tail, chunk])
+
+
+def event_frame(
+    events: EventStream,
+    t_us: int,
+    ideal_px: Array,
+    trajectory: Trajectory,
+    camera: Camera,
+    frames: FramesConfig,
+    detect: DetectConfig,
+) -> EventFrame:
+    """The windows of one frame, undistorted and with the camera's rotation undone.
+
+    Args:
+        events: a stream that covers the longest window.
+        t_us: time of the frame.
+        ideal_px: (H, W, 2) float32 undistortion table of the camera.
+        trajectory, camera: poses over the window and calibration.
+        frames, detect: their tables of the configuration.
+    """
+    counts = window_event_counts(detect, camera.width * camera.height)
+    ranges = [window_range(events.t_us, t_us, count, frames) for count in counts]
+    start = min(first for first, _ in ranges)
+    stop = max(last for _, last in ranges)
+    largest = events.slice(start, stop, t_us)
+    own_px = ideal_px[largest.y, largest.x]
+    compensated_px = own_px
+    if frames.compensate_rotation and len(largest):
+        compensated_px = _compensated(largest, ideal_px, trajectory, camera.matrix, frames.slot_us)
+    return EventFrame(
+        events=largest,
+        ideal_px=own_px,
+        compensated_px=compensated_px,
+        windows=tuple((first - start, last - start) for first, last in ranges),
+        width=camera.width,
+        height=camera.height,
+    )
+
+
+def window_event_counts(config: DetectConfig, pixel_count: int) -> tuple[int, ...]:
+    """Events of each window, smallest first."""
+    counts = config.window_event_counts or tuple(
+        round(density * pixel_count) for density in config.window_events_per_pixel
+    )
+    return tuple(sorted(max(1, count) for count in counts))
+
+
+def window_range(
+    t_us: IntArray, centre_us: int, count: int, config: FramesConfig
+) -> tuple[int, int]:
+    """Half-open index range of about `count` events, half of them on each side of a time.
+
+    The window is never shorter than `min_half_window_us` nor longer than `max_half_window_us` on
+    either side.
+    """
+    middle = int(np.searchsorted(t_us, centre_us))
+    reach = [config.max_half_window_us, config.min_half_window_us]
+    low_max, low_min = np.searchsorted(t_us, [centre_us - r for r in reach])
+    high_max, high_min = np.searchsorted(t_us, [centre_us + r for r in reach])
+    start = min(max(middle - count // 2, int(low_max)), int(low_min))
+    stop = max(min(middle + count // 2, int(high_max)), int(high_min))
+    return start, stop
+
+
+def _compensated(
+    events: EventSlice, ideal_px: Array, trajectory: Trajectory, K: FloatArray, slot_us: int
+) -> Array:
+    """(K, 2) float32 pixels x' ~ K R_i^T R(t) K^-1 x; exact for rotation, at any depth."""
+    first_us = int(events.t_us[0])
+    slot_count = (int(events.t_us[-1]) - first_us) // slot_us + 1
+    middles_us = first_us + np.arange(slot_count) * slot_us + slot_us // 2
+    middles_us = np.clip(middles_us, trajectory.t_us[0], trajectory.t_us[-1])
+    R_world_slot = trajectory.interpolate(middles_us).rotation
+    R_world_frame = trajectory.interpolate(np.array([events.t_ref_us])).rotation[0]
+    homographies = K @ R_world_frame.T @ R_world_slot @ np.linalg.inv(K)
+    compensated_px = np.empty((len(events), 2), np.float32)
+    frames_kernels.compensate(
+        events.t_us, events.x, events.y, ideal_px, first_us, slot_us, homographies, compensated_px
+    )
+    return compensated_px
+
+
+def event_images(frame: EventFrame, config: DetectConfig) -> Iterator[EventImage]:
+    """Every representation of every window, smoothed."""
+    for start, stop in frame.windows:
+        if stop == start:
+            continue
+        for representation in config.representations:
+            yield from REPRESENTATION_IMAGES[representation](frame, start, stop, config.blur_px)
+
+
+def _counts(frame: EventFrame, start: int, stop: int) -> Array:
+    images = np.zeros((2, frame.height, frame.width), np.float32)
+    polarity = frame.events.polarity[start:stop]
+    frames_kernels.splat(frame.compensated_px[start:stop], polarity, images)
+    return images
+
+
+def _binary(frame: EventFrame, start: int, stop: int, blur_px: float) -> Iterator[EventImage]:
+    """White where an event fell."""
+    rows = np.rint(frame.compensated_px[start:stop])
+    inside = (rows >= 0).all(axis=1) & (rows < [frame.width, frame.height]).all(axis=1)
+    column, row = rows[inside].astype(np.intp).T
+    grey = np.zeros((frame.height, frame.width), np.float32)
+    grey[row, column] = 255.0
+    yield EventImage(grey=_smooth(grey, blur_px), polarity=UNKNOWN_POLARITY)
+
+
+def _timestamp(frame: EventFrame, start: int, stop: int, blur_px: float) -> Iterator[EventImage]:
+    """The last event's place in the window's time, an image a polarity [paper: timestamp image]."""
+    t_us = frame.events.t_us[start:stop]
+    span_us = max(1, int(t_us[-1] - t_us[0]))
+    last_us = np.full((2, frame.height, frame.width), t_us[0])
+    polarity = frame.events.polarity[start:stop]
+    frames_kernels.latest(frame.compensated_px[start:stop], polarity, t_us, last_us)
+    for label, times in zip((-1, 1), last_us, strict=True):
+        grey = ((times - t_us[0]) * (255.0 / span_us)).astype(np.float32)
+        yield EventImage(grey=_smooth(grey, blur_px), polarity=label)
+
+
+def _count(frame: EventFrame, start: int, stop: int, blur_px: float) -> Iterator[EventImage]:
+    """How many events fell, an image a polarity."""
+    for label, counts in zip((-1, 1), _counts(frame, start, stop), strict=True):
+        yield EventImage(grey=_tone_mapped(counts, blur_px), polarity=label)
+
+
+def _count_sum(frame: EventFrame, start: int, stop: int, blur_px: float) -> Iterator[EventImage]:
+    """How many events fell, both polarities together."""
+    counts = _counts(frame, start, stop).sum(axis=0)
+    yield EventImage(grey=_tone_mapped(counts, blur_px), polarity=UNKNOWN_POLARITY)
+
+
+REPRESENTATION_IMAGES = {
+    "binary": _binary,
+    "timestamp": _timestamp,
+    "count": _count,
+    "count_sum": _count_sum,
+}
+
+
+def _smooth(grey: Array, blur_px: float) -> Array:
+    if blur_px > 0:
+        grey = cv2.GaussianBlur(grey, (0, 0), blur_px)
+    return np.asarray(np.rint(grey), dtype=np.uint8)
+
+
+def _tone_mapped(counts: Array, blur_px: float) -> Array:
+    """255 (1 - exp(-1.2 g / g75)): dense edges do not drown sparse ones."""
+    if blur_px > 0:
+        counts = cv2.GaussianBlur(counts, (0, 0), blur_px)
+    drawn = counts[counts > MIN_COUNT]
+    if len(drawn) == 0:
+        return np.zeros(counts.shape, np.uint8)
+    scale = COUNT_GAIN / np.percentile(drawn, 75)
+    return np.asarray(np.rint(255.0 * (1.0 - np.exp(-scale * counts))), dtype=np.uint8)
+
+
+def frames_at(t_us: IntArray, trajectory: Trajectory, camera: Camera) -> Frames:
+    """Times and poses of the frames that were looked at."""
+    return Frames(
+        t_us=t_us,
+        T_world_camera=trajectory.interpolate(t_us),
+        K=camera.matrix,
+        width=camera.width,
+        height=camera.height,
+    )
+
+
+def undistortion_table(camera: Camera) -> Array:
+    """(H, W, 2) float32: ideal pinhole pixel of every raw pixel, NaN outside the model."""
+    return projection.undistortion_table(camera)
