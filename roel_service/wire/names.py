@@ -1,0 +1,85 @@
+"""Names of resources: `projects/default/eventStreams/{id}` and its like."""
+
+from __future__ import annotations
+
+import re
+
+from roel_service.errors import InputError, NotFoundError
+
+PROJECT = "projects/default"
+LATEST = "latest"
+
+_ID = re.compile(r"[a-z][a-z0-9-]{2,62}")
+_OPERATION = re.compile(r"operations/([0-9a-f]{32})")
+_VERSION = re.compile(r"(.+)/versions/(?:v([1-9][0-9]{0,8})|latest)")
+
+
+def checked_id(value: str, subject: str) -> str:
+    """`value` if it can name a resource; raises `InputError` ID_INVALID otherwise."""
+    if not _ID.fullmatch(value):
+        raise InputError(subject, f"an id like {_ID.pattern}", repr(value), reason="ID_INVALID")
+    return value
+
+
+def check_parent(parent: str) -> None:
+    """Raises `NotFoundError` unless this is the one project there is."""
+    if parent != PROJECT:
+        raise NotFoundError("parent", PROJECT, repr(parent))
+
+
+def event_stream_name(event_stream_id: str) -> str:
+    """The name of a recording."""
+    return f"{PROJECT}/eventStreams/{event_stream_id}"
+
+
+def event_stream_id(name: str) -> str:
+    """The id in a recording's name; raises `InputError` for any other text."""
+    return _id_below(name, f"{PROJECT}/eventStreams/")
+
+
+def map_name(map_id: str) -> str:
+    """The name of a map."""
+    return f"{PROJECT}/maps/{map_id}"
+
+
+def map_id(name: str) -> str:
+    """The id in a map's name; raises `InputError` for any other text."""
+    return _id_below(name, f"{PROJECT}/maps/")
+
+
+def map_version_name(map_id: str, version: int | str) -> str:
+    """The name of a version, by its number or the alias `latest`."""
+    label = version if version == LATEST else f"v{version}"
+    return f"{map_name(map_id)}/versions/{label}"
+
+
+def map_version_id(name: str) -> tuple[str, int | None]:
+    """Map id and number in a version's name, None for `latest`; raises `InputError` otherwise."""
+    match = _VERSION.fullmatch(name)
+    if match is None:
+        raise _bad_name(name, f"{PROJECT}/maps/ID/versions/vNUMBER")
+    return map_id(match[1]), int(match[2]) if match[2] else None
+
+
+def operation_name(operation_id: str) -> str:
+    """The name of an operation."""
+    return f"operations/{operation_id}"
+
+
+def operation_id(name: str) -> str:
+    """The id in an operation's name; raises `InputError` for any other text."""
+    match = _OPERATION.fullmatch(name)
+    if match is None:
+        raise _bad_name(name, "operations/UUID")
+    return match[1]
+
+
+def _id_below(name: str, collection: str) -> str:
+    tail = name.removeprefix(collection)
+    if tail == name or not _ID.fullmatch(tail):
+        raise _bad_name(name, f"{collection}ID")
+    return tail
+
+
+def _bad_name(name: str, expected: str) -> InputError:
+    return InputError("name", expected, repr(name), reason="NAME_INVALID")
