@@ -128,11 +128,10 @@ def plane_line_angle(
     Returns:
         (*B,) angles in [0, pi/2] rad.
     """
-    slope = np.abs(dot(normal, direction))
     d = dot(normal, foot - centre) / length_scale_m
-    # Rounding can push |n.v| past one.
-    within = np.sqrt(np.maximum(1.0 - slope * slope, 0.0))
-    return np.asarray(np.arctan2(np.hypot(slope, d), within), dtype=np.float64)
+    # |n x v| rather than sqrt(1 - (n.v)^2), which has few digits left when the line is upright.
+    within = norm(np.cross(normal, direction))
+    return np.asarray(np.arctan2(np.hypot(dot(normal, direction), d), within), dtype=np.float64)
 
 
 def plane_line_jacobians(

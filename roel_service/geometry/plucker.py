@@ -80,17 +80,13 @@ def orthonormal_from_plucker(
         phi is 0 and the second column is any unit vector normal to the direction.
     """
     direction, moment = np.broadcast_arrays(direction, moment)
-    length_m = norm(moment)
-    through_origin = length_m == 0
-    column = np.where(
-        through_origin[..., None],
-        any_normal(direction),
-        moment / np.where(through_origin, 1.0, length_m)[..., None],
-    )
-    # The cross product of a moment of a few denormals need not be a unit vector.
-    third = unit(np.cross(direction, column))
+    foot = nearest_to_origin(direction, moment)
+    length_m = norm(foot)
+    # A moment is normal to its direction; one that is not is the rounding error of zero.
+    through_origin = length_m <= 0.5 * norm(moment)
+    third = np.where(through_origin[..., None], any_normal(direction), unit(foot))
     U = np.stack([direction, np.cross(third, direction), third], axis=-1)
-    return U, np.asarray(np.arctan(length_m), dtype=np.float64)
+    return U, np.where(through_origin, 0.0, np.arctan(length_m))
 
 
 def plucker_from_orthonormal(U: FloatArray, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
