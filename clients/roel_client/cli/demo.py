@@ -1,0 +1,62 @@
+"""`roel demo`: simulate, build, compare with the truth, show."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from roel_client.cli import evaluate
+from roel_client.cli.output import print_result, progress_bar, to_json
+from roel_client.cli.parser import Command, Subparsers, command
+from roel_client.cli.staging import Staged
+from roel_service.config.load import load_config
+
+SEED = 7
+SECONDS = 3.0
+
+
+def add_commands(subparsers: Subparsers) -> None:
+    """Declare `demo`."""
+    what = Command(run=demo, folders=("out",), scratch=True)
+    parser = command(
+        subparsers, "demo", "simulate a room, map it and compare the map with the truth", what
+    )
+    parser.add_argument("--out", metavar="DIR", help="new or empty folder to keep everything in")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+
+
+def demo(options: argparse.Namespace, staged: Staged) -> None:
+    """Run the whole chain on a simulated room."""
+    from roel_client import local
+
+    folder = staged.get("out", staged["scratch"])
+    room = folder / "room"
+    room.mkdir(parents=True)
+    with progress_bar() as progress:
+        local.simulate(room, SEED, progress, seconds=SECONDS)
+    recording = local.open_recording(
+        str(room / "events.h5"), str(room / "poses.txt"), str(room / "camera.json"), None
+    )
+    with progress_bar() as progress:
+        built = local.build_map(recording, load_config("default"), server=None, progress=progress)
+    (folder / "map.rlm").write_bytes(built.rlm_bytes)
+    (folder / "report.json").write_text(to_json(built.report) + "\n", encoding="utf-8")
+    local.draw_map(built.line_map, recording, folder / "map.png")
+    truth = str(room / "gt.npz")
+    figures = local.evaluate_map(str(folder / "map.rlm"), truth, truth)
+    picture = None if options.out is None else str(Path(options.out, "map.png"))
+    document = {"report": built.report, "evaluation": figures, "picture": picture}
+    print_result(document, _told(document), as_json=options.json)
+
+
+def _told(document: dict[str, Any]) -> str:
+    report, picture = document["report"], document["picture"]
+    return "\n".join(
+        [
+            f"built {report['line_count']} lines from {report['event_count']} events of a "
+            f"simulated room in {report['seconds_total']:.1f} s",
+            evaluate.told(document["evaluation"]),
+            f"picture: {picture}" if picture else "nothing is kept; --out DIR keeps it all",
+        ]
+    )

@@ -1,0 +1,134 @@
+"""Entry of the console script: parse, check the named files, run, answer with an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+
+from roel_client.cli import configuration, demo, evaluate, health, maps, serve, simulate
+from roel_client.cli.output import LogHandler, logging_to_stderr, say, write_crash_report
+from roel_client.cli.parser import LOG_LEVELS, Command, Parser, UsageError
+from roel_client.cli.process import Interrupted, ignore_signals, interruptible, run_in_child
+from roel_client.cli.staging import NamedFiles, publish, staging
+from roel_service import __version__
+from roel_service.errors import Cancelled, NoAnswerError, RoelError
+
+DONE, BUG, UNUSABLE, NO_ANSWER = 0, 1, 2, 3
+
+# Faults of the place that outputs go to, met while writing; everything else is checked before.
+WRITE_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command line and return its exit code."""
+    command_line = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        with interruptible():
+            return answer(lambda: run(command_line), command_line)
+    except Interrupted as interrupted:
+        return interrupted.exit_code
+
+
+def run(command_line: list[str]) -> int:
+    """Parse the command line and run its command, in a child unless it handles signals itself."""
+    options = parser().parse_args(command_line)
+    command: Command = options.command
+    with logging_to_stderr(log_level(options)) as log:
+        if command.in_child:
+            return run_staged(command, options, log, command_line)
+        command.run(options, {})
+        return DONE
+
+
+def run_staged(
+    command: Command, options: argparse.Namespace, log: LogHandler, command_line: list[str]
+) -> int:
+    """Run a command in a child, and move its outputs to their places when it is done."""
+    files = named_files(command, options)
+    files.check()
+    with staging(files) as staged:
+
+        def work() -> int:
+            command.run(options, staged)
+            log.flush()
+            return DONE
+
+        code = run_in_child(lambda: answer(work, command_line))
+        if code == DONE:
+            ignore_signals()
+            publish(files, staged)
+    return code if code >= 0 else ended_by_signal(-code, command_line)
+
+
+def answer(work: Callable[[], int], command_line: list[str]) -> int:
+    """Exit code of `work`; what it raises becomes one line on stderr and the code for it."""
+    try:
+        return work()
+    except NoAnswerError as error:
+        say(f"roel: no answer: {error}")
+        return NO_ANSWER
+    except RoelError as error:
+        say(f"roel: error: {error}")
+        return UNUSABLE
+    except Cancelled:
+        return 128 + signal.SIGINT
+    except BrokenPipeError:
+        # Nobody reads stdout any more, as in `roel map info ... | head -0`.
+        return 128 + signal.SIGPIPE
+    except Exception as error:  # the border of the process: whatever is left is a bug
+        if isinstance(error, OSError) and error.errno in WRITE_FAULTS:
+            say(f"roel: error: {error.filename or 'output'}: expected room, found {error.strerror}")
+            return UNUSABLE
+        return bug("".join(traceback.format_exception(error)), command_line)
+
+
+def bug(what: str, command_line: list[str]) -> int:
+    """Report a fault of this program."""
+    if "debug" in (os.environ.get("ROEL_LOG_LEVEL"), *command_line):
+        sys.stderr.write(what)
+    say(f"roel: internal error: crash report in {write_crash_report(command_line, what)}")
+    return BUG
+
+
+def ended_by_signal(number: int, command_line: list[str]) -> int:
+    """Exit code for a child that a signal ended which did not come through this process."""
+    if number in (signal.SIGINT, signal.SIGTERM):
+        return 128 + number
+    return bug(f"the worker was ended by {signal.Signals(number).name}", command_line)
+
+
+def parser() -> Parser:
+    """The whole command line; building it imports no algorithm."""
+    top = Parser(prog="roel", description="3D line maps from event cameras.")
+    top.add_argument("--version", action="version", version=f"roel {__version__}")
+    subparsers = top.add_subparsers(required=True, metavar="COMMAND")
+    for group in (maps, evaluate, simulate, configuration, serve, health, demo):
+        group.add_commands(subparsers)
+    return top
+
+
+def log_level(options: argparse.Namespace) -> str:
+    """The level asked for by option or environment."""
+    level = options.log_level or os.environ.get("ROEL_LOG_LEVEL") or "warning"
+    if level not in LOG_LEVELS:
+        raise UsageError("ROEL_LOG_LEVEL", f"one of {', '.join(LOG_LEVELS)}", repr(level))
+    return str(level)
+
+
+def named_files(command: Command, options: argparse.Namespace) -> NamedFiles:
+    """The files and folders that the user named."""
+
+    def given(names: tuple[str, ...]) -> dict[str, str]:
+        return {name: value for name in names if (value := getattr(options, name)) is not None}
+
+    return NamedFiles(
+        inputs=given(command.inputs),
+        outputs=given(command.outputs),
+        folders=given(command.folders),
+        scratch=command.scratch,
+    )

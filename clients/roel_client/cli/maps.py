@@ -1,0 +1,141 @@
+"""`roel map build`, `roel map info`, `roel map export`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from roel_client.cli.configuration import add_config_options, effective_config
+from roel_client.cli.output import print_result, progress_bar, to_json
+from roel_client.cli.parser import (
+    Command,
+    Parser,
+    Subparsers,
+    address,
+    command,
+    command_group,
+    integer,
+    size,
+    suffixed,
+)
+from roel_client.cli.staging import Staged
+
+EXPORT_SUFFIXES = (".npz", ".ply", ".obj", ".json", ".csv", ".dxf")
+
+
+def add_commands(subparsers: Subparsers) -> None:
+    """Declare the commands below `map`."""
+    group = command_group(subparsers, "map", "build, look at and convert line maps")
+    _add_build(group)
+    _add_info(group)
+    _add_export(group)
+
+
+def _add_build(group: Subparsers) -> None:
+    build = Command(
+        run=build_map,
+        inputs=("events", "poses", "camera", "config"),
+        outputs=("out", "report", "plot"),
+    )
+    parser = command(group, "build", "build a map from events and camera poses", build)
+    add_recording_options(parser)
+    parser.add_argument("--out", required=True, metavar="MAP.rlm", help="the map")
+    add_config_options(parser)
+    parser.add_argument("--report", metavar="FILE.json", help="how the build went")
+    parser.add_argument(
+        "--plot",
+        type=suffixed(".png"),
+        metavar="FILE.png",
+        help="the map over the events and from above",
+    )
+    parser.add_argument("--seed", type=integer(0), metavar="N", help="fixes all randomness (0)")
+    parser.add_argument(
+        "--server", type=address, metavar="HOST:PORT", help="let this server build the map"
+    )
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def add_recording_options(parser: Parser) -> None:
+    """The files that make up a recording."""
+    parser.add_argument(
+        "--events", required=True, metavar="FILE", help="HDF5, NPZ, or text `t_seconds x y p`"
+    )
+    parser.add_argument(
+        "--poses", required=True, metavar="FILE", help="TUM text `t tx ty tz qx qy qz qw`"
+    )
+    parser.add_argument(
+        "--camera", required=True, metavar="FILE", help="calibration as JSON, YAML or one line"
+    )
+    parser.add_argument(
+        "--sensor-size", type=size, metavar="WxH", help="for a calibration that does not say it"
+    )
+
+
+def build_map(options: argparse.Namespace, staged: Staged) -> None:
+    """Build a map here or on a server, and write it with its report and picture."""
+    from roel_client import local
+
+    seed = {} if options.seed is None else {"runtime": {"seed": options.seed}}
+    config = effective_config(options, seed)
+    recording = local.open_recording(
+        options.events, options.poses, options.camera, options.sensor_size
+    )
+    with progress_bar() as progress:
+        built = local.build_map(recording, config, server=options.server, progress=progress)
+    if "plot" in staged:
+        local.draw_map(built.line_map, recording, staged["plot"])
+    staged["out"].write_bytes(built.rlm_bytes)
+    if "report" in staged:
+        staged["report"].write_text(to_json(built.report) + "\n", encoding="utf-8")
+    print_result(built.report, _told(built.report, options.out), as_json=options.json)
+
+
+def _told(report: dict[str, Any], out: str) -> str:
+    return (
+        f"{out}: {report['line_count']} lines from {report['event_count']} events "
+        f"in {report['frame_count']} frames; {report['seconds_total']:.1f} s, "
+        f"at most {report['peak_rss_mib']:.0f} MiB"
+    )
+
+
+def _add_info(group: Subparsers) -> None:
+    info = Command(run=show_info, inputs=("map",))
+    parser = command(group, "info", "say what a map file holds", info)
+    parser.add_argument("map", metavar="MAP.rlm")
+    parser.add_argument("--json", action="store_true", help="print as JSON")
+
+
+def show_info(options: argparse.Namespace, staged: Staged) -> None:
+    """Print what a map file holds."""
+    from roel_client import local
+
+    info = local.describe_map(options.map)
+    text = "\n".join(f"{key:<16}{_shown(value)}" for key, value in info.items())
+    print_result(info, text, as_json=options.json)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(_shown(item) for item in value)
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _add_export(group: Subparsers) -> None:
+    export = Command(run=export_map, inputs=("map",), outputs=("out",))
+    parser = command(group, "export", "write a map in another format", export)
+    parser.add_argument("map", metavar="MAP.rlm")
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=suffixed(*EXPORT_SUFFIXES),
+        metavar="FILE",
+        help="its suffix picks the format: " + " ".join(EXPORT_SUFFIXES),
+    )
+
+
+def export_map(options: argparse.Namespace, staged: Staged) -> None:
+    """Write a map in the format that the output's suffix names."""
+    from roel_client import local
+
+    local.export_map(options.map, Path(staged["out"]))
