@@ -72,9 +72,10 @@ def position_along(points: FloatArray, segments: FloatArray) -> FloatArray:
 def angle_rad(segments_1: FloatArray, segments_2: FloatArray) -> FloatArray:
     """(*B,) unsigned angles in [0, pi/2] between infinite lines."""
     direction_1, direction_2 = unit(span(segments_1)), unit(span(segments_2))
-    cosine = dot(direction_1, direction_2)
-    sine = norm(direction_1 - cosine[..., None] * direction_2)
-    return np.asarray(np.arctan2(sine, np.abs(cosine)), dtype=np.float64)
+    # Kahan's formula: diagonals of the rhombus, exact at all angles and equal in both orders.
+    along, against = norm(direction_1 + direction_2), norm(direction_1 - direction_2)
+    narrow, wide = np.minimum(along, against), np.maximum(along, against)
+    return np.asarray(2.0 * np.arctan2(narrow, wide), dtype=np.float64)
 
 
 def perpendicular_one_way(segments_1: FloatArray, segments_2: FloatArray) -> FloatArray:
