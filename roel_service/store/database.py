@@ -1,0 +1,60 @@
+"""SQLite behind SQLAlchemy Core: many readers, one writer, durable commits."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sqlalchemy import Connection, create_engine, event
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from roel_service.store.schema import migrate
+
+PRAGMAS = (
+    "PRAGMA journal_mode = WAL",
+    "PRAGMA synchronous = FULL",
+    "PRAGMA busy_timeout = 5000",
+    "PRAGMA foreign_keys = ON",
+)
+
+
+class Database:
+    """The rows of one data folder, opened by one process at a time."""
+
+    def __init__(self, path: Path) -> None:
+        # Autocommit leaves BEGIN and COMMIT to `write`: the driver would begin late and deferred.
+        self._engine = create_engine(f"sqlite:///{path}", isolation_level="AUTOCOMMIT")
+        event.listen(self._engine, "connect", _configure)
+        self._lock = threading.Lock()
+        with self.write() as connection:
+            migrate(connection)
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        """One transaction; files that belong to it become durable while it is open."""
+        with self._lock, self._engine.connect() as connection:
+            connection.exec_driver_sql("BEGIN IMMEDIATE")
+            try:
+                yield connection
+            except BaseException:
+                connection.exec_driver_sql("ROLLBACK")
+                raise
+            connection.exec_driver_sql("COMMIT")
+
+    @contextmanager
+    def read(self) -> Iterator[Connection]:
+        """Statements that each see the newest commit."""
+        with self._engine.connect() as connection:
+            yield connection
+
+    def close(self) -> None:
+        """Give back every connection."""
+        self._engine.dispose()
+
+
+def _configure(connection: sqlite3.Connection, _: ConnectionPoolEntry) -> None:
+    for pragma in PRAGMAS:
+        connection.execute(pragma)

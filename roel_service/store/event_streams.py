@@ -1,0 +1,302 @@
+"""Recordings: rows, append files and, once finalized, blobs."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, RowMapping, delete, exists, insert, select, update
+
+from roel_service.errors import (
+    ConflictError,
+    EventsError,
+    LimitError,
+    NotFoundError,
+    StateError,
+    TrajectoryError,
+)
+from roel_service.scene.camera import Camera
+from roel_service.store.blobs import BlobStore
+from roel_service.store.database import Database
+from roel_service.store.recordings import Recordings
+from roel_service.store.records import (
+    UNFINISHED,
+    EventStreamRecord,
+    StreamState,
+    event_stream_from_row,
+    now_us,
+    row_from_record,
+    stored,
+)
+from roel_service.store.references import delete_unreferenced
+from roel_service.store.schema import EVENT_CHUNK, EVENT_STREAM, OPERATION, POSE_PART
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk:
+    """Events as they are stored; `data` has been decoded once and found sound."""
+
+    seq: int
+    t0_us: int
+    t1_us: int
+    event_count: int
+    data: bytes
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.data).hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosePart:
+    """Poses as they are stored; `data` has been decoded once and found sound."""
+
+    t0_us: int
+    t1_us: int
+    pose_count: int
+    data: bytes
+
+
+class EventStreams:
+    """Repository of recordings. Every method that changes something is durable on return."""
+
+    def __init__(self, database: Database, blobs: BlobStore, recordings: Recordings) -> None:
+        self._database = database
+        self._blobs = blobs
+        self._recordings = recordings
+
+    def create(self, stream_id: str, camera: Camera) -> EventStreamRecord:
+        """Open a recording; raises `ConflictError` ALREADY_EXISTS."""
+        record = EventStreamRecord(
+            id=stream_id,
+            uid=uuid.uuid4().hex,
+            state=StreamState.OPEN,
+            camera=camera,
+            chunk_count=0,
+            event_count=0,
+            size_bytes=0,
+            start_us=0,
+            end_us=0,
+            pose_count=0,
+            digest="",
+            create_time_us=now_us(),
+        )
+        with self._database.write() as connection:
+            if _row(connection, stream_id) is not None:
+                expected = "an id not in use"
+                raise ConflictError("event stream", expected, stream_id, reason="ALREADY_EXISTS")
+            connection.execute(insert(EVENT_STREAM), row_from_record(record))
+            self._recordings.create(record.uid)
+        return record
+
+    def get(self, stream_id: str) -> EventStreamRecord:
+        """One recording; raises `NotFoundError`."""
+        with self._database.read() as connection:
+            return _get(connection, stream_id)
+
+    def page(self, after_id: str, limit: int) -> list[EventStreamRecord]:
+        """Recordings with an id above `after_id`, in the order of ids."""
+        query = select(EVENT_STREAM).where(EVENT_STREAM.c.id > after_id)
+        with self._database.read() as connection:
+            rows = connection.execute(query.order_by(EVENT_STREAM.c.id).limit(limit)).mappings()
+            return [event_stream_from_row(row) for row in rows]
+
+    def append_chunks(
+        self, stream_id: str, chunks: Sequence[Chunk], max_size_bytes: int
+    ) -> EventStreamRecord:
+        """Append chunks, all or none; those already stored are compared and left out.
+
+        Raises:
+            StateError: STREAM_FINALIZED, or SEQUENCE_GAP with the number that is expected.
+            ConflictError: CHUNK_CONFLICT, a stored chunk comes again with other bytes.
+            EventsError: a chunk that begins before the end of the one before it.
+            LimitError: EVENT_STREAM_TOO_LARGE.
+        """
+        with self._database.write() as connection:
+            record = _get_open(connection, stream_id)
+            fresh = [chunk for chunk in chunks if not _is_repeat(connection, record, chunk)]
+            if not fresh:
+                return record
+            _check_order(record, fresh)
+            rows = _chunk_rows(record, fresh)
+            size_bytes = rows[-1]["offset"] + rows[-1]["length"]
+            if size_bytes > max_size_bytes:
+                expected = f"at most {max_size_bytes} bytes of events"
+                reason = "EVENT_STREAM_TOO_LARGE"
+                raise LimitError("event stream", expected, f"{size_bytes}", reason=reason)
+            self._recordings.append(record.uid, record.size_bytes, (chunk.data for chunk in fresh))
+            connection.execute(insert(EVENT_CHUNK), rows)
+            return _update(
+                connection,
+                record,
+                chunk_count=record.chunk_count + len(fresh),
+                event_count=record.event_count + sum(chunk.event_count for chunk in fresh),
+                size_bytes=size_bytes,
+                start_us=record.start_us if record.chunk_count else fresh[0].t0_us,
+                end_us=fresh[-1].t1_us,
+            )
+
+    def append_poses(
+        self, stream_id: str, part: PosePart, max_pose_count: int
+    ) -> EventStreamRecord:
+        """Append poses that begin after all stored ones.
+
+        Raises:
+            StateError: STREAM_FINALIZED.
+            TrajectoryError: the part does not begin after the stored poses.
+            LimitError: TOO_MANY_POSES.
+        """
+        with self._database.write() as connection:
+            record = _get_open(connection, stream_id)
+            parts = _pose_rows(connection, record.uid)
+            if parts and part.t0_us <= parts[-1]["t1_us"]:
+                expected = f"poses after {parts[-1]['t1_us']} us"
+                raise TrajectoryError("poses", expected, f"{part.t0_us} us")
+            pose_count = record.pose_count + part.pose_count
+            if pose_count > max_pose_count:
+                expected = f"at most {max_pose_count}"
+                raise LimitError("poses", expected, f"{pose_count}", reason="TOO_MANY_POSES")
+            row = {
+                "stream_uid": record.uid,
+                "seq": len(parts),
+                "pose_count": part.pose_count,
+                "t0_us": part.t0_us,
+                "t1_us": part.t1_us,
+                "sha256": self._blobs.put(part.data),
+            }
+            connection.execute(insert(POSE_PART), row)
+            return _update(connection, record, pose_count=pose_count)
+
+    def finalize(self, stream_id: str) -> EventStreamRecord:
+        """Freeze a recording and seal its events into a blob; raises `EventsError` NO_EVENTS."""
+        with self._database.write() as connection:
+            record = _get(connection, stream_id)
+            if record.state is StreamState.FINALIZED:
+                return record
+            if record.event_count == 0:
+                raise EventsError(stream_id, "events", "none", reason="NO_EVENTS")
+            digest = self._blobs.adopt(self._recordings.cut(record.uid, record.size_bytes))
+            sealed = _update(connection, record, state=StreamState.FINALIZED, digest=digest)
+        self._recordings.delete(record.uid)
+        return sealed
+
+    def delete(self, stream_id: str) -> None:
+        """Forget a recording; raises `StateError` STREAM_IN_USE while a build reads it."""
+        with self._database.write() as connection:
+            record = _get(connection, stream_id)
+            if _is_in_use(connection, stream_id):
+                raise StateError(stream_id, "no build", "one at work", reason="STREAM_IN_USE")
+            poses = {row["sha256"] for row in _pose_rows(connection, record.uid)}
+            connection.execute(delete(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid))
+        self._recordings.delete(record.uid)
+        delete_unreferenced(self._database, self._blobs, poses | {record.digest})
+
+    def event_file(self, record: EventStreamRecord) -> Path:
+        """The sealed chunks of a finalized recording."""
+        return self._blobs.path(record.digest)
+
+    def pose_files(self, record: EventStreamRecord) -> list[Path]:
+        """The pose parts of a recording, in the order of time."""
+        with self._database.read() as connection:
+            return [self._blobs.path(row["sha256"]) for row in _pose_rows(connection, record.uid)]
+
+    def open_uids(self) -> set[str]:
+        """Recordings that still have an append file."""
+        query = select(EVENT_STREAM.c.uid).where(EVENT_STREAM.c.state == StreamState.OPEN.value)
+        with self._database.read() as connection:
+            return set(connection.scalars(query))
+
+
+def get_finalized(connection: Connection, stream_id: str) -> EventStreamRecord:
+    """A recording that can be mapped; raises `StateError` STREAM_NOT_FINALIZED."""
+    record = _get(connection, stream_id)
+    if record.state is not StreamState.FINALIZED:
+        reason = "STREAM_NOT_FINALIZED"
+        raise StateError(stream_id, "a finalized recording", record.state.value, reason=reason)
+    return record
+
+
+def _row(connection: Connection, stream_id: str) -> RowMapping | None:
+    query = select(EVENT_STREAM).where(EVENT_STREAM.c.id == stream_id)
+    return connection.execute(query).mappings().one_or_none()
+
+
+def _get(connection: Connection, stream_id: str) -> EventStreamRecord:
+    row = _row(connection, stream_id)
+    if row is None:
+        raise NotFoundError("event stream", "an existing one", stream_id)
+    return event_stream_from_row(row)
+
+
+def _get_open(connection: Connection, stream_id: str) -> EventStreamRecord:
+    record = _get(connection, stream_id)
+    if record.state is not StreamState.OPEN:
+        reason = "STREAM_FINALIZED"
+        raise StateError(stream_id, "an open recording", record.state.value, reason=reason)
+    return record
+
+
+def _update(connection: Connection, record: EventStreamRecord, **values: Any) -> EventStreamRecord:
+    row = update(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid)
+    connection.execute(row.values(stored(values)))
+    return dataclasses.replace(record, **values)
+
+
+def _is_repeat(connection: Connection, record: EventStreamRecord, chunk: Chunk) -> bool:
+    if chunk.seq >= record.chunk_count:
+        return False
+    query = select(EVENT_CHUNK.c.sha256).where(
+        EVENT_CHUNK.c.stream_uid == record.uid, EVENT_CHUNK.c.seq == chunk.seq
+    )
+    if connection.execute(query).scalar_one() != chunk.sha256:
+        expected = "the bytes that were stored"
+        reason = "CHUNK_CONFLICT"
+        raise ConflictError(f"chunk {chunk.seq}", expected, "other bytes", reason=reason)
+    return True
+
+
+def _check_order(record: EventStreamRecord, chunks: Sequence[Chunk]) -> None:
+    end_us = record.end_us if record.chunk_count else chunks[0].t0_us
+    for seq, chunk in enumerate(chunks, start=record.chunk_count):
+        if chunk.seq != seq:
+            raise StateError("chunk", f"seq {seq}", f"seq {chunk.seq}", reason="SEQUENCE_GAP")
+        if chunk.t0_us < end_us:
+            expected = f"events from {end_us} us on"
+            reason = "EVENT_TIME_NOT_MONOTONE"
+            raise EventsError(f"chunk {seq}", expected, f"{chunk.t0_us} us", reason=reason)
+        end_us = chunk.t1_us
+
+
+def _chunk_rows(record: EventStreamRecord, chunks: Sequence[Chunk]) -> list[dict[str, Any]]:
+    rows = []
+    offset = record.size_bytes
+    for chunk in chunks:
+        row = {
+            "stream_uid": record.uid,
+            "seq": chunk.seq,
+            "t0_us": chunk.t0_us,
+            "t1_us": chunk.t1_us,
+            "event_count": chunk.event_count,
+            "offset": offset,
+            "length": len(chunk.data),
+            "sha256": chunk.sha256,
+        }
+        rows.append(row)
+        offset += len(chunk.data)
+    return rows
+
+
+def _pose_rows(connection: Connection, uid: str) -> Sequence[RowMapping]:
+    query = select(POSE_PART).where(POSE_PART.c.stream_uid == uid).order_by(POSE_PART.c.seq)
+    return connection.execute(query).mappings().all()
+
+
+def _is_in_use(connection: Connection, stream_id: str) -> bool:
+    unfinished = OPERATION.c.state.in_([state.value for state in UNFINISHED])
+    query = select(exists().where(OPERATION.c.event_stream_id == stream_id, unfinished))
+    return bool(connection.execute(query).scalar_one())

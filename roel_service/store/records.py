@@ -1,0 +1,182 @@
+"""Rows as values."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from sqlalchemy import RowMapping
+
+from roel_service.scene.camera import Camera, CameraModel
+
+
+class StreamState(Enum):
+    """Life of a recording."""
+
+    OPEN = "open"
+    FINALIZED = "finalized"
+
+
+class VersionState(Enum):
+    """Life of a map version."""
+
+    CREATING = "creating"
+    ACTIVE = "active"
+    FAILED = "failed"
+
+
+class OperationState(Enum):
+    """Life of an operation."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def is_final(self) -> bool:
+        return self not in UNFINISHED
+
+
+UNFINISHED = (OperationState.QUEUED, OperationState.RUNNING)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventStreamRecord:
+    """A recording without its events.
+
+    Attributes:
+        id: chosen by the client, unique among the living.
+        uid: chosen by the server, never used again; names the append file.
+        start_us, end_us: first and last event on the clock of the poses; 0 without events.
+        digest: hexadecimal SHA-256 of all chunks in order; empty until finalized.
+    """
+
+    id: str
+    uid: str
+    state: StreamState
+    camera: Camera
+    chunk_count: int
+    event_count: int
+    size_bytes: int
+    start_us: int
+    end_us: int
+    pose_count: int
+    digest: str
+    create_time_us: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRecord:
+    """A named map; its versions are 1 to `version_count`."""
+
+    id: str
+    version_count: int
+    create_time_us: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapVersionRecord:
+    """One version; all from `sha256` to `report` are empty until it is ACTIVE.
+
+    Attributes:
+        sha256, size_bytes: of the map file.
+        bounds_m: lower corner, then upper corner, 6 numbers.
+        report: of the build, as the command line prints it.
+    """
+
+    map_id: str
+    version: int
+    state: VersionState
+    event_stream_id: str
+    operation_id: str
+    sha256: str
+    size_bytes: int
+    line_count: int
+    bounds_m: list[float]
+    report: dict[str, Any]
+    create_time_us: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class OperationRecord:
+    """A build, from its request to its end.
+
+    Attributes:
+        error: what went wrong, as the caller of the store encoded it; empty unless FAILED.
+        update_seq: grows with every change.
+        end_time_us: 0 until it is final.
+    """
+
+    id: str
+    map_id: str
+    version: int
+    event_stream_id: str
+    state: OperationState
+    stage: str
+    done_count: int
+    total_count: int
+    fraction: float
+    error: bytes
+    update_seq: int
+    create_time_us: int
+    end_time_us: int
+
+
+def now_us() -> int:
+    """Microseconds since 1970 (UTC)."""
+    return time.time_ns() // 1000
+
+
+def row_from_record(record: Any) -> dict[str, Any]:
+    """Columns and values of one record."""
+    return stored({item.name: getattr(record, item.name) for item in dataclasses.fields(record)})
+
+
+def stored(values: dict[str, Any]) -> dict[str, Any]:
+    """The values in the form of their columns."""
+    return {name: _stored(value) for name, value in values.items()}
+
+
+def event_stream_from_row(row: RowMapping) -> EventStreamRecord:
+    """The inverse of `row_from_record`."""
+    camera = _camera_from_json(row["camera"])
+    return EventStreamRecord(**{**row, "state": StreamState(row["state"]), "camera": camera})
+
+
+def map_from_row(row: RowMapping) -> MapRecord:
+    """The inverse of `row_from_record`."""
+    return MapRecord(**row)
+
+
+def map_version_from_row(row: RowMapping) -> MapVersionRecord:
+    """The inverse of `row_from_record`."""
+    parsed = {name: json.loads(row[name]) for name in ("bounds_m", "report")}
+    return MapVersionRecord(**{**row, **parsed, "state": VersionState(row["state"])})
+
+
+def operation_from_row(row: RowMapping) -> OperationRecord:
+    """The inverse of `row_from_record`."""
+    return OperationRecord(**{**row, "state": OperationState(row["state"])})
+
+
+def _stored(value: Any) -> Any:
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Camera):
+        return json.dumps({**dataclasses.asdict(value), "model": value.model.value})
+    if isinstance(value, list | dict):
+        return json.dumps(value)
+    return value
+
+
+def _camera_from_json(text: str) -> Camera:
+    values = json.loads(text)
+    model = CameraModel(values.pop("model"))
+    distortion = tuple(values.pop("distortion"))
+    return Camera(**values, model=model, distortion=distortion)

@@ -1,0 +1,73 @@
+"""One data folder: `rows.sqlite`, `blobs/sha256`, `recordings`, and the lock on all of them."""
+
+from __future__ import annotations
+
+import fcntl
+from pathlib import Path
+from types import TracebackType
+
+from roel_service.errors import StateError
+from roel_service.store.blobs import BlobStore
+from roel_service.store.builds import Builds
+from roel_service.store.database import Database
+from roel_service.store.event_streams import EventStreams
+from roel_service.store.files import make_folder
+from roel_service.store.maps import Maps
+from roel_service.store.recordings import Recordings
+from roel_service.store.references import referenced
+
+
+class Store:
+    """What a server remembers; a context manager that holds the folder's lock.
+
+    Attributes:
+        event_streams, maps, builds: the repositories.
+
+    Raises:
+        StateError: DATA_IN_USE, another server has the folder; DATA_TOO_NEW.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        make_folder(folder)
+        self._lock = _FolderLock(folder)
+        self._database = Database(folder / "rows.sqlite")
+        self._blobs = BlobStore(folder / "blobs" / "sha256")
+        self._recordings = Recordings(folder / "recordings")
+        self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
+        self.maps = Maps(self._database, self._blobs)
+        self.builds = Builds(self._database, self._blobs)
+        self._sweep()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._database.close()
+        self._lock.release()
+
+    def _sweep(self) -> None:
+        """Delete files that no row names: a crash left them, and nothing is being written yet."""
+        with self._database.read() as connection:
+            self._blobs.sweep(referenced(connection))
+        self._recordings.sweep(self.event_streams.open_uids())
+
+
+class _FolderLock:
+    """An advisory lock that ends with the process, however it ends."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = (folder / "lock").open("w")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self._file.close()
+            expected = "a data folder that no other server uses"
+            raise StateError(str(folder), expected, "one in use", reason="DATA_IN_USE") from error
+
+    def release(self) -> None:
+        self._file.close()
