@@ -26,5 +26,9 @@ class Progress:
 ProgressCallback = Callable[[Progress], None]
 
 
+# The same within one stage: units of work done, and in total.
+StepCallback = Callable[[int, int], None]
+
+
 def ignore(progress: Progress) -> None:
     """Let the algorithm run; nobody is watching."""

@@ -279,7 +279,7 @@ class TrimConfig(Stage, table="trim"):
     Attributes:
         method: `coverage` (runs seen by enough frames, gaps stay gaps) or `cluster` (two ends
             from clustered candidates, as published).
-        bin_m, max_gap_m, min_length_m: resolution, bridged gap and shortest run (`coverage`).
+        max_gap_m, min_length_m: bridged gap (`coverage`) and shortest segment.
         min_pixel_gap_px: gaps below this many pixels at the viewing distance are bridged too.
         min_coverage_count, min_coverage_fraction: frames that must have seen a bin, absolute and
             against the best bin.
@@ -292,7 +292,6 @@ class TrimConfig(Stage, table="trim"):
     """
 
     method: str = parameter("coverage", one_of(TRIM_METHODS))
-    bin_m: float = parameter(0.004, POSITIVE)
     max_gap_m: float = parameter(0.03, NOT_NEGATIVE)
     min_length_m: float = parameter(0.03, NOT_NEGATIVE)
     min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)

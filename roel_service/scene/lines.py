@@ -60,9 +60,12 @@ class LineObservations:
 class LineTracks:
     """Observations of the same 3D line; those of track j are observation[offsets[j]:offsets[j+1]].
 
+    While lines are still being re-associated an observation may support several of them; in a
+    finished map it supports at most one (see `is_exclusive`).
+
     Attributes:
         offsets: (L + 1,) int64.
-        observation: (S,) int32 indices into `LineObservations`, each at most once.
+        observation: (S,) int32 indices into `LineObservations`.
     """
 
     offsets: IntArray
@@ -73,8 +76,6 @@ class LineTracks:
         observation = frozen_array(self.observation, np.int32, (None,), "observation")
         if offsets[0] != 0 or offsets[-1] != len(observation) or (np.diff(offsets) < 0).any():
             raise ValueError("offsets: expected a non-decreasing partition of the observations")
-        if len(np.unique(observation)) != len(observation):
-            raise ValueError("observation: expected each observation in at most one track")
         object.__setattr__(self, "offsets", offsets)
         object.__setattr__(self, "observation", observation)
 
@@ -84,6 +85,32 @@ class LineTracks:
     def __getitem__(self, index: int) -> Array:
         """(n,) observations of one track."""
         return self.observation[self.offsets[index] : self.offsets[index + 1]]
+
+    @property
+    def sizes(self) -> IntArray:
+        """(L,) observations of each track."""
+        return np.diff(self.offsets)
+
+    @property
+    def track_of_row(self) -> IntArray:
+        """(S,) the track of each row of `observation`."""
+        return np.repeat(np.arange(len(self)), self.sizes)
+
+    def is_exclusive(self) -> bool:
+        """Whether each observation is in at most one track."""
+        return len(np.unique(self.observation)) == len(self.observation)
+
+    def take(self, tracks: Array) -> LineTracks:
+        """The tracks of these indices, or of this mask, in that order."""
+        return LineTracks.from_lists([self[track] for track in np.arange(len(self))[tracks]])
+
+    @staticmethod
+    def from_rows(track: IntArray, observation: Array, count: int) -> LineTracks:
+        """`count` tracks from (S,) pairs of track and observation, in the order of the rows."""
+        order = np.argsort(track, kind="stable")
+        sizes = np.bincount(track, minlength=count)
+        offsets = np.concatenate([[0], np.cumsum(sizes)])
+        return LineTracks(offsets=offsets, observation=observation[order])
 
     @staticmethod
     def from_lists(lists: list[Array]) -> LineTracks:
@@ -120,6 +147,10 @@ class InfiniteLines:
 
     def __len__(self) -> int:
         return len(self.direction)
+
+    def take(self, lines: Array) -> InfiniteLines:
+        """The lines of these indices, or of this mask, in that order."""
+        return InfiniteLines(direction=self.direction[lines], moment=self.moment[lines])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,0 +1,227 @@
+"""Lines of distant frames that belong together.
+
+Paper: "Local and Global Line Matching", the global part. Two methods:
+
+- `reassociate`: triangulated lines are projected into every frame, take up what fits there, and
+  are refined again, in rounds of shrinking distance (`docs/paper_map.md`, deviation).
+- `sampled`: the paper's scheme. Frames are sampled, each is matched against its nearest ones, and
+  tracks with corresponding lines are joined. Correspondences come from a `LineMatcher`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from scipy import sparse
+
+from roel_service.arrays import FloatArray, IntArray
+from roel_service.config.stages import MatchGlobalConfig, RefineConfig
+from roel_service.geometry import plucker, projection, segments
+from roel_service.geometry.se3 import SE3
+from roel_service.geometry.vectors import norm
+from roel_service.mapping import match_global_kernels
+from roel_service.mapping.frames import Frames
+from roel_service.mapping.refine import Evidence, Refined, refine_lines
+from roel_service.mapping.trim import covered_spans
+from roel_service.mapping.views import Views, end_residuals_px
+from roel_service.progress import StepCallback
+from roel_service.scene.lines import InfiniteLines, LineObservations, LineTracks
+from roel_service.scene.trajectory import Trajectory
+
+# A line is looked for this much beyond what is covered of it, at each end.
+LENGTHENING = 0.1
+# Lines are projected where they are at least this far in front of the camera, as a share of their
+# own distance.
+NEAR_SHARE = 1e-3
+# Shorter projections are not looked at.
+MIN_PROJECTION_PX = 5.0
+# How much many observations count against a small residual when lines compete for one: px for a
+# factor of e.
+COMPETITION_PX = 0.3
+# Half of the time step over which the camera's velocity is measured.
+VELOCITY_HALF_STEP_US = 5_000
+
+
+class LineMatcher(Protocol):
+    """Finds the same lines in two frames."""
+
+    def match(self, frame_i: int, frame_j: int) -> IntArray:
+        """(n, 2) observations of frame i and of frame j that show the same line."""
+        ...
+
+
+def reassociate(
+    refined: Refined,
+    evidence: Evidence,
+    observations: LineObservations,
+    frames: Frames,
+    trajectory: Trajectory,
+    config: MatchGlobalConfig,
+    refine: RefineConfig,
+    *,
+    speed_is_known: bool,
+    progress: StepCallback,
+) -> Refined:
+    """Let lines collect their observations from all frames, in rounds; then make them exclusive.
+
+    Args:
+        refined: first lines with their tracks.
+        evidence, observations: of all frames.
+        frames, trajectory: poses; the trajectory gives the camera's velocity.
+        config: distances of the rounds and gates.
+        refine: how lines are refined between the rounds.
+        speed_is_known: observed speeds have the camera's rotation undone and can be predicted.
+        progress: called once a round; may raise `Cancelled`.
+    """
+    velocity = _velocities(frames, trajectory) if speed_is_known else None
+    round_count = len(config.max_distances_px)
+    for index, max_distance_px in enumerate(config.max_distances_px):
+        progress(index, round_count)
+        found = _associate(
+            refined, evidence.views, observations, frames, velocity, max_distance_px, config
+        )
+        refined = _usable(refine_lines(refined.lines, found, evidence, frames, refine))
+        refined = _without_shared(refined, len(observations), config.max_shared_fraction)
+    exclusive = _exclusive(refined, evidence.views, frames)
+    return _usable(refine_lines(refined.lines, exclusive, evidence, frames, refine))
+
+
+def _usable(refined: Refined) -> Refined:
+    """Without the lines that diverged."""
+    return refined.take(~refined.diverged)
+
+
+def _velocities(frames: Frames, trajectory: Trajectory) -> FloatArray:
+    """(N, 3) camera velocity at each frame, m/s, world."""
+    limits = trajectory.t_us[[0, -1]]
+    before = np.clip(frames.t_us - VELOCITY_HALF_STEP_US, *limits)
+    after = np.clip(frames.t_us + VELOCITY_HALF_STEP_US, *limits)
+    moved = trajectory.interpolate(after).translation - trajectory.interpolate(before).translation
+    return moved / ((after - before) * 1e-6)[:, None]
+
+
+def _associate(
+    refined: Refined,
+    views: Views,
+    observations: LineObservations,
+    frames: Frames,
+    velocity: FloatArray | None,
+    max_distance_px: float,
+    config: MatchGlobalConfig,
+) -> LineTracks:
+    """Each line's inliers so far, and every observation that lies along its projection."""
+    spans = _lengthened(refined, views)
+    first = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
+    lines = [refined.tracks.track_of_row]
+    members = [refined.tracks.observation]
+    for frame in range(len(frames)):
+        T_camera_world = frames.T_world_camera[frame].inverse()
+        projected = project_segments(spans, T_camera_world, frames)
+        image_line, its_rate = _image_lines(refined.lines, frames, frame, velocity)
+        current = slice(first[frame], first[frame + 1])
+        line, member = match_global_kernels.observations_along(
+            projected,
+            image_line,
+            its_rate,
+            observations.segments_px[current],
+            observations.normal_speed_px_per_ms[current],
+            max_distance_px,
+            config.min_overlap,
+            config.max_speed_difference_px_per_ms if velocity is not None else np.inf,
+        )
+        lines.append(line)
+        members.append(member + first[frame])
+    pairs = np.unique(np.stack([np.concatenate(lines), np.concatenate(members)]), axis=1)
+    return LineTracks.from_rows(pairs[0], pairs[1], len(refined))
+
+
+def _lengthened(refined: Refined, views: Views) -> FloatArray:
+    """(L, 2, 3) the covered part of each line, longer by `LENGTHENING` at each end, world."""
+    spans_m = covered_spans(refined.lines, refined.tracks, views)
+    extra_m = LENGTHENING * (spans_m[:, 1] - spans_m[:, 0])
+    spans_m = spans_m + np.stack([-extra_m, extra_m], axis=-1)
+    return plucker.endpoints_from_plucker(refined.lines.direction, refined.lines.moment, spans_m)
+
+
+def project_segments(segments_world: FloatArray, T_camera_world: SE3, frames: Frames) -> FloatArray:
+    """(L, 2, 2) px of 3D segments in one camera; NaN where nothing of them is in its image."""
+    in_camera = T_camera_world @ segments_world
+    distance_m = np.abs(in_camera[..., 2]).max(axis=-1)
+    clipped = projection.clip_to_depth(in_camera, np.fmax(NEAR_SHARE * distance_m, 1e-9)[:, None])
+    projected = projection.project(clipped, frames.K)
+    size_px = np.array([frames.width, frames.height])
+    low, high = projected.min(axis=1), projected.max(axis=1)
+    seen = ((high >= 0) & (low < size_px)).all(axis=-1)
+    long_enough = segments.length(projected) >= MIN_PROJECTION_PX
+    return np.where((seen & long_enough)[:, None, None], projected, np.nan)
+
+
+def _image_lines(
+    lines: InfiniteLines, frames: Frames, frame: int, velocity: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """(L, 3) images (a, b, c), a^2 + b^2 = 1, in one frame, and their (L, 3) change a ms.
+
+    The change is that of a camera that moves but does not turn: the frame's events have their
+    rotation undone. Without a velocity it is zero.
+    """
+    R = frames.T_world_camera.rotation[frame]
+    centre = frames.T_world_camera.translation[frame]
+    moment = plucker.shift_origin(lines.direction, lines.moment, centre) @ R
+    to_image = np.linalg.inv(frames.K)
+    image = moment @ to_image
+    scale = norm(image[:, :2])[:, None]
+    if velocity is None:
+        return image / scale, np.zeros_like(image)
+    moment_rate = -np.cross(velocity[frame] * 1e-3, lines.direction) @ R
+    return image / scale, moment_rate @ to_image / scale
+
+
+def _without_shared(
+    refined: Refined, observation_count: int, max_shared_fraction: float
+) -> Refined:
+    """Of two lines that share most of the smaller one's observations, only the larger one.
+
+    Pairs are judged one by one, from the largest line on; there are no chains of neighbours.
+    """
+    sizes = refined.tracks.sizes
+    shared = _shared_counts(refined.tracks, observation_count)
+    rank = np.argsort(np.argsort(-sizes, kind="stable"), kind="stable")
+    kept = np.ones(len(refined), dtype=bool)
+    for line in np.argsort(rank):
+        if not kept[line]:
+            continue
+        row = slice(shared.indptr[line], shared.indptr[line + 1])
+        others = shared.indices[row]
+        too_much = shared.data[row] > max_shared_fraction * np.minimum(sizes[line], sizes[others])
+        kept[others[too_much & (rank[others] > rank[line])]] = False
+    return refined.take(kept)
+
+
+def _shared_counts(tracks: LineTracks, observation_count: int) -> sparse.csr_matrix:
+    """(L, L) how many observations each pair of lines has in common."""
+    ones = np.ones(len(tracks.observation), np.int32)
+    membership = sparse.csr_matrix(
+        (ones, tracks.observation, tracks.offsets), shape=(len(tracks), observation_count)
+    )
+    return sparse.csr_matrix(membership @ membership.T)
+
+
+def _exclusive(refined: Refined, views: Views, frames: Frames) -> LineTracks:
+    """Each observation with the one line it fits best; large lines get a bonus."""
+    tracks = refined.tracks
+    line = tracks.track_of_row
+    residual_px = np.abs(
+        end_residuals_px(
+            views.take(tracks.observation),
+            refined.lines.direction[line],
+            refined.lines.moment[line],
+            frames.focal_px,
+        )
+    ).max(axis=-1)
+    cost = residual_px - COMPETITION_PX * np.log(tracks.sizes[line])
+    order = np.lexsort([line, cost, tracks.observation])
+    first = np.ones(len(order), dtype=bool)
+    first[1:] = np.diff(tracks.observation[order]) != 0
+    winners = np.sort(order[first])
+    return LineTracks.from_rows(line[winners], tracks.observation[winners], len(tracks))

@@ -1,0 +1,121 @@
+"""Tracks of lines through neighbouring frames.
+
+Paper: "Local and Global Line Matching", the local part: mutual nearest neighbours by perpendicular
+distance. With `predict`, a line is first moved by its own speed and by the camera's rotation.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
+from roel_service.config.stages import MatchLocalConfig
+from roel_service.geometry import segments
+from roel_service.mapping.frames import UNKNOWN_POLARITY, Frames
+from roel_service.scene.lines import LineObservations, LineTracks
+
+
+def match_adjacent_frames(
+    observations: LineObservations, frames: Frames, config: MatchLocalConfig
+) -> LineTracks:
+    """Link lines of neighbouring frames into tracks, at most one line of a frame in each.
+
+    A track stays open for `reach_frame_count` frames; every line starts or continues one.
+    """
+    first = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
+    track = np.full(len(observations), -1)
+    track_count = 0
+    open_ends = np.empty(0, np.int64)
+    for frame in range(len(frames)):
+        current = np.arange(first[frame], first[frame + 1])
+        reach = observations.frame[open_ends] >= frame - config.reach_frame_count
+        open_ends = open_ends[reach]
+        before, after = _mutual_nearest(open_ends, current, observations, frames, config)
+        track[after] = track[before]
+        new = current[track[current] < 0]
+        track[new] = track_count + np.arange(len(new))
+        track_count += len(new)
+        continued = np.isin(open_ends, before)
+        open_ends = np.concatenate([open_ends[~continued], current])
+    return LineTracks.from_rows(track, np.arange(len(track)), track_count)
+
+
+def _mutual_nearest(
+    before: IntArray,
+    after: IntArray,
+    observations: LineObservations,
+    frames: Frames,
+    config: MatchLocalConfig,
+) -> tuple[IntArray, IntArray]:
+    """Pairs of observations that are each other's nearest and pass the gates."""
+    if len(before) == 0 or len(after) == 0:
+        return before[:0], after[:0]
+    cost = _cost(before, after, observations, frames, config)
+    nearest_after = cost.argmin(axis=1)
+    nearest_before = cost.argmin(axis=0)
+    mutual = nearest_before[nearest_after] == np.arange(len(before))
+    mutual &= cost[np.arange(len(before)), nearest_after] < config.max_distance_px
+    return before[mutual], after[nearest_after[mutual]]
+
+
+def _cost(
+    before: IntArray,
+    after: IntArray,
+    observations: LineObservations,
+    frames: Frames,
+    config: MatchLocalConfig,
+) -> FloatArray:
+    """(B, A) distances in px, infinite where polarity or overlap forbid the pair."""
+    lines_before = observations.segments_px[before][:, None]
+    lines_after = observations.segments_px[after][None]
+    if config.predict:
+        moved = predict(before, observations.frame[after[:1]], observations, frames)[:, None]
+        returned = np.empty((len(before), len(after), 2, 2))
+        for frame in np.unique(observations.frame[before]):
+            rows = observations.frame[before] == frame
+            returned[rows] = predict(after, np.array([frame]), observations, frames)
+        cost = 0.5 * (_one_way(moved, lines_after) + _one_way(returned, lines_before))
+        facing = facing_share(moved, lines_after)
+    else:
+        cost = segments.perpendicular(lines_before, lines_after)
+        facing = facing_share(lines_before, lines_after)
+    allowed = _same_polarity(observations.polarity[before], observations.polarity[after])
+    allowed &= (facing >= config.min_overlap) & (facing > 0)
+    return np.where(allowed, cost, np.inf)
+
+
+def predict(
+    indices: IntArray, to_frame: Array, observations: LineObservations, frames: Frames
+) -> FloatArray:
+    """(n, 2, 2) where observed lines lie in another frame: moved by their speed, then turned.
+
+    The normal speed lives in the pixels of the line's own frame, with its rotation undone.
+    """
+    lines_px = observations.segments_px[indices]
+    own_frame = observations.frame[indices]
+    left = segments.left_normal(lines_px)
+    step_ms = (frames.t_us[to_frame] - frames.t_us[own_frame]) * 1e-3
+    shift = (observations.normal_speed_px_per_ms[indices] * step_ms)[:, None] * left
+    R = frames.T_world_camera.rotation
+    R_to_own = np.swapaxes(R[to_frame], -1, -2) @ R[own_frame]
+    H = frames.K @ R_to_own @ np.linalg.inv(frames.K)
+    moved = lines_px + shift[:, None]
+    homogeneous = moved @ np.swapaxes(H[:, :, :2], -1, -2) + H[:, None, :, 2]
+    return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
+
+
+def _one_way(moved: FloatArray, others: FloatArray) -> FloatArray:
+    """(*B,) mean of the larger and the average distance of the ends to the other line, px."""
+    ends = np.abs(segments.point_line_offset(moved, others[..., None, :, :]))
+    return np.asarray(0.5 * ends.max(axis=-1) + 0.5 * ends.mean(axis=-1))
+
+
+def facing_share(moved: FloatArray, others: FloatArray) -> FloatArray:
+    """(*B,) length over which two segments face each other, as a share of the shorter one."""
+    shorter = np.minimum(segments.length(moved), segments.length(others))
+    return segments.overlap(moved, others) * segments.length(others) / shorter
+
+
+def _same_polarity(before: Array, after: Array) -> BoolArray:
+    unknown = (before[:, None] == UNKNOWN_POLARITY) | (after[None] == UNKNOWN_POLARITY)
+    return np.asarray(unknown | (before[:, None] == after[None]))

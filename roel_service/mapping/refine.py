@@ -1,0 +1,313 @@
+"""Least squares over all observations and events of each line.
+
+Paper: "Multi-view Line Optimization", with the poses held fixed. Lines then do not share any
+unknown, and all of them are solved together as a batch of systems of four: damped Gauss-Newton in
+the orthonormal parameterisation, about an own origin for each line (the mean of its cameras), where
+the moment's length is the viewing distance and far from zero.
+
+Two costs, see `RefineConfig.residual`:
+
+- `pixel`: line and event term are quadratic forms y^T G y / |m_c|^2 of the Pluecker coordinates
+  y = (v, m), in squared pixels (`moments`), with a robust weight an observation.
+- `grassmann`: the published plane-to-line residual (n.v, d/sqrt(1 + d^2)) weighted by the 2D
+  length, plus lambda times the sum over the events.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.arrays import Array, BoolArray, FloatArray
+from roel_service.config.stages import RefineConfig
+from roel_service.geometry import grassmann, plucker
+from roel_service.geometry.vectors import dot
+from roel_service.mapping.frames import Frames
+from roel_service.mapping.moments import camera_from_world_lines
+from roel_service.mapping.views import Views, cuts_m, end_residuals_px
+from roel_service.scene.lines import InfiniteLines, LineTracks
+
+# Damping relative to the diagonal: start, and factors after a good and a bad step.
+FIRST_DAMPING = 1e-6
+DAMPING_AFTER_SUCCESS = 0.3
+DAMPING_AFTER_FAILURE = 30.0
+# No step turns a line by more than this.
+MAX_TURN_RAD = 0.2
+# In the first steps outliers may lie this much farther out than later.
+FIRST_GATE = 1.5
+LOOSE_ITERATION_COUNT = 2
+# Keeps the 4x4 systems of lines regular that no observation holds in some direction.
+RIDGE = 1e-12
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """Everything that is measured about the observations, for the costs.
+
+    Attributes:
+        views: M viewing planes.
+        event_forms: (M, 6, 6) mean of a a^T over the events, camera frame.
+        segment_forms: (M, 6, 6) the same over three points of the segment.
+        event_counts: (M,) events behind each form.
+    """
+
+    views: Views
+    event_forms: FloatArray
+    segment_forms: FloatArray
+    event_counts: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Refined:
+    """Lines after refinement.
+
+    Attributes:
+        lines: L lines, world.
+        tracks: the inliers of each line.
+        rms_px: (L,) root mean square of the inliers' larger end residual.
+        origin: (L, 3) m, world, about which each line was solved.
+        information: (L, 4, 4) in the orthonormal tangent about the origin, 1/px^2 for `pixel`.
+        diverged: (L,) fewer inliers than needed, or no finite solution.
+    """
+
+    lines: InfiniteLines
+    tracks: LineTracks
+    rms_px: FloatArray
+    origin: FloatArray
+    information: FloatArray
+    diverged: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def take(self, lines: Array) -> Refined:
+        """The lines of these indices, or of this mask, in that order."""
+        return Refined(
+            lines=self.lines.take(lines),
+            tracks=self.tracks.take(lines),
+            rms_px=self.rms_px[lines],
+            origin=self.origin[lines],
+            information=self.information[lines],
+            diverged=self.diverged[lines],
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _State:
+    """Orthonormal lines about their own origins: U (L, 3, 3), phi (L,)."""
+
+    U: FloatArray
+    phi: FloatArray
+
+    @property
+    def plucker(self) -> tuple[FloatArray, FloatArray]:
+        return plucker.plucker_from_orthonormal(self.U, self.phi)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _System:
+    """Normal equations of all lines: cost (L,), gradient (L, 4), Hessian (L, 4, 4)."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class _Problem:
+    """The observations of all lines in one list, each row with its line."""
+
+    def __init__(
+        self,
+        lines: InfiniteLines,
+        tracks: LineTracks,
+        evidence: Evidence,
+        frames: Frames,
+        config: RefineConfig,
+    ) -> None:
+        self.config = config
+        self.focal_px = frames.focal_px
+        self.offsets = tracks.offsets
+        self.line = tracks.track_of_row
+        self.views = evidence.views.take(tracks.observation)
+        self.origin = self.mean(self.views.centre)
+        self.centre = self.views.centre - self.origin[self.line]
+        events = evidence.event_forms[tracks.observation]
+        A = camera_from_world_lines(frames, self.views.frame, self.origin[self.line])
+        self.moment_form = np.swapaxes(A[:, 3:], -1, -2) @ A[:, 3:]
+        self.event_count = np.minimum(
+            evidence.event_counts[tracks.observation], config.event_count_per_line or np.inf
+        )
+        if config.residual == "pixel":
+            segments = evidence.segment_forms[tracks.observation]
+            forms = self.focal_px**2 * (segments + config.event_weight * events)
+            cap = config.max_length_weight_px
+            self.weight = np.minimum(self.views.length_px, cap) / cap
+        else:
+            forms = config.event_weight * self.event_count[:, None, None] * events
+            self.weight = self.views.length_px
+        self.form = np.swapaxes(A, -1, -2) @ forms @ A
+
+    def total(self, rows: FloatArray) -> FloatArray:
+        """(L, ...) sums of (S, ...) rows over each line."""
+        padded = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
+        sums = np.add.reduceat(padded, self.offsets[:-1], axis=0)
+        sums[np.diff(self.offsets) == 0] = 0.0
+        return np.asarray(sums, dtype=np.float64)
+
+    def mean(self, rows: FloatArray) -> FloatArray:
+        """(L, ...) means of (S, ...) rows over each line; 0 for a line without rows."""
+        counts = np.maximum(np.diff(self.offsets), 1)
+        return self.total(rows) / counts.reshape(-1, *[1] * (rows.ndim - 1))
+
+    def residual_px(self, state: _State) -> FloatArray:
+        """(S,) larger end residual of each observation, px."""
+        v, m = state.plucker
+        local = Views(**(vars(self.views) | {"centre": self.centre}))
+        ends = end_residuals_px(local, v[self.line], m[self.line], self.focal_px)
+        return np.asarray(np.abs(ends).max(axis=-1))
+
+    def inliers(self, residual_px: FloatArray, iteration: int) -> BoolArray:
+        """(S,) observations within the gate, which is wider in the first steps."""
+        loose = FIRST_GATE if iteration < LOOSE_ITERATION_COUNT else 1.0
+        return np.asarray(residual_px < loose * self.config.max_residual_px)
+
+    def robust_weight(self, residual_px: FloatArray) -> FloatArray:
+        """(S,) weights of iterated reweighting."""
+        if self.config.loss == "squared":
+            return np.ones_like(residual_px)
+        return np.asarray(1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2))
+
+    def system(self, state: _State, weight: FloatArray) -> _System:
+        """Cost, gradient and Gauss-Newton Hessian with fixed (S,) robust weights."""
+        if self.config.residual == "pixel":
+            return self._form_system(state, weight * self.weight)
+        events = self._form_system(state, weight)
+        planes = self._plane_system(state, weight * self.weight)
+        return _System(
+            cost=events.cost + planes.cost,
+            gradient=events.gradient + planes.gradient,
+            hessian=events.hessian + planes.hessian,
+        )
+
+    def _form_system(self, state: _State, weight: FloatArray) -> _System:
+        """Of sum w y^T G y / y^T N y, where y^T N y = |m_c|^2."""
+        v, m = state.plucker
+        y = np.concatenate([v, m], axis=-1)
+        rows = y[self.line]
+        squared = dot(rows, np.einsum("sij,sj->si", self.moment_form, rows))
+        quotient = dot(rows, np.einsum("sij,sj->si", self.form, rows)) / squared
+        scaled = (weight / squared)[:, None, None]
+        forms = self.total(scaled * self.form)
+        # The quotient's own derivative: minus r^2 N.
+        pull = self.total(scaled * quotient[:, None, None] * self.moment_form)
+        dv, dm = plucker.plucker_jacobians(state.U, state.phi)
+        J = np.concatenate([dv, dm], axis=-2)
+        return _System(
+            cost=self.total(weight * quotient),
+            gradient=np.einsum("lij,li->lj", J, np.einsum("lij,lj->li", forms - pull, y)),
+            hessian=np.swapaxes(J, -1, -2) @ forms @ J,
+        )
+
+    def _plane_system(self, state: _State, weight: FloatArray) -> _System:
+        """Of sum w |(n.v, d / sqrt(1 + d^2))|^2, taken at the middle of the observed interval."""
+        v, m = state.plucker
+        along = self._middles_m(state)[self.line]
+        foot = plucker.nearest_to_origin(v, m)[self.line] + along[:, None] * v[self.line]
+        r = grassmann.plane_line_residual(self.views.normal, self.centre, v[self.line], foot)
+        by_line, _ = grassmann.plane_line_jacobians(
+            self.views.normal, self.centre, state.U[self.line], state.phi[self.line], along
+        )
+        weighted = weight[:, None, None] * by_line
+        return _System(
+            cost=self.total(weight * dot(r, r)),
+            gradient=self.total(np.einsum("sij,si->sj", weighted, r)),
+            hessian=self.total(np.swapaxes(by_line, -1, -2) @ weighted),
+        )
+
+    def _middles_m(self, state: _State) -> FloatArray:
+        """(L,) mean arc length of the observed ends."""
+        v, m = state.plucker
+        local = Views(**(vars(self.views) | {"centre": self.centre}))
+        cuts, _ = cuts_m(local, v[self.line], m[self.line])
+        return self.mean(np.nan_to_num(cuts.mean(axis=-1)))
+
+
+def refine_lines(
+    lines: InfiniteLines,
+    tracks: LineTracks,
+    evidence: Evidence,
+    frames: Frames,
+    config: RefineConfig,
+) -> Refined:
+    """Refine every line over its observations; the poses stay as they are.
+
+    Args:
+        lines: L first estimates, world.
+        tracks: the observations of each line.
+        evidence: of all observations.
+        frames: poses and calibration.
+        config: cost, loss, gates and number of steps.
+    """
+    problem = _Problem(lines, tracks, evidence, frames, config)
+    moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
+    U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
+    state = _State(U=U, phi=phi)
+    damping = np.full(len(lines), FIRST_DAMPING)
+    weight = np.zeros(len(problem.line))
+    for iteration in range(config.iteration_count):
+        residual_px = problem.residual_px(state)
+        weight = problem.robust_weight(residual_px) * problem.inliers(residual_px, iteration)
+        state, damping = _step(problem, state, weight, damping)
+    residual_px = problem.residual_px(state)
+    inlier = problem.inliers(residual_px, config.iteration_count)
+    system = problem.system(state, problem.robust_weight(residual_px) * inlier)
+    return _refined(problem, tracks, state, residual_px, inlier, system)
+
+
+def _step(
+    problem: _Problem, state: _State, weight: FloatArray, damping: FloatArray
+) -> tuple[_State, FloatArray]:
+    """One damped step of every line; a line whose cost would grow stays and is damped more."""
+    system = problem.system(state, weight)
+    diagonal = np.einsum("lii->li", system.hessian)
+    damped = system.hessian + np.einsum(
+        "li,ij->lij", damping[:, None] * diagonal + RIDGE, np.eye(4)
+    )
+    delta = -np.linalg.solve(damped, system.gradient[..., None])[..., 0]
+    turn = np.linalg.norm(delta[:, :3], axis=1)
+    delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
+    U, phi = plucker.retract_orthonormal(state.U, state.phi, delta)
+    trial = _State(U=U, phi=phi)
+    better = problem.system(trial, weight).cost <= system.cost
+    return (
+        _State(
+            U=np.where(better[:, None, None], trial.U, state.U),
+            phi=np.where(better, trial.phi, state.phi),
+        ),
+        damping * np.where(better, DAMPING_AFTER_SUCCESS, DAMPING_AFTER_FAILURE),
+    )
+
+
+def _refined(
+    problem: _Problem,
+    tracks: LineTracks,
+    state: _State,
+    residual_px: FloatArray,
+    inlier: BoolArray,
+    system: _System,
+) -> Refined:
+    direction, moment = state.plucker
+    moment = plucker.shift_origin(direction, moment, -problem.origin)
+    counts = problem.total(inlier.astype(np.float64))
+    squares = problem.total(np.where(inlier, residual_px**2, 0.0))
+    finite = np.isfinite(moment).all(axis=-1) & np.isfinite(system.hessian).all(axis=(-2, -1))
+    kept = tracks.observation[inlier]
+    return Refined(
+        lines=InfiniteLines(direction=direction, moment=moment),
+        tracks=LineTracks(offsets=np.concatenate([[0], np.cumsum(counts)]), observation=kept),
+        rms_px=np.sqrt(squares / np.maximum(counts, 1.0)),
+        origin=problem.origin,
+        information=system.hessian,
+        diverged=~finite | (counts < problem.config.min_inlier_count),
+    )
