@@ -88,8 +88,8 @@ def staging(files: NamedFiles) -> Iterator[Staged]:
     with ExitStack() as stack:
         staged = {}
         if files.scratch:
-            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="roel-"))
-            staged["scratch"] = Path(folder)
+            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="roel-"))
+            staged["scratch"] = Path(scratch)
         for option, name in [*files.outputs.items(), *files.folders.items()]:
             place = Path(os.path.realpath(name))
             folder = Path(tempfile.mkdtemp(prefix=".roel-", dir=place.parent))
