@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roel_service.arrays import FloatArray
-from roel_service.errors import CameraError
+from roel_service.errors import CameraError, PanoramaError
 from roel_service.geometry.projection import CameraModel
 
 __all__ = ["DISTORTION_COUNTS", "Camera", "CameraModel", "Equirectangular"]
@@ -84,7 +84,15 @@ class Equirectangular:
 
     Attributes:
         width, height: px; width is twice the height.
+
+    Raises:
+        PanoramaError: other sizes.
     """
 
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        if not (self.height > 0 and self.width == 2 * self.height):
+            found = f"{self.width} x {self.height}"
+            raise PanoramaError("panorama", "a width of twice the height", found)

@@ -51,6 +51,7 @@ class LineObservations:
             ("event_dt_us", np.int32, (events,)),
         ):
             object.__setattr__(self, name, frozen_array(getattr(self, name), dtype, shape, name))
+        _require_partition(self.event_offsets, events, "event_offsets")
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -74,8 +75,7 @@ class LineTracks:
     def __post_init__(self) -> None:
         offsets = frozen_array(self.offsets, np.int64, (None,), "offsets")
         observation = frozen_array(self.observation, np.int32, (None,), "observation")
-        if offsets[0] != 0 or offsets[-1] != len(observation) or (np.diff(offsets) < 0).any():
-            raise ValueError("offsets: expected a non-decreasing partition of the observations")
+        _require_partition(offsets, len(observation), "offsets")
         object.__setattr__(self, "offsets", offsets)
         object.__setattr__(self, "observation", observation)
 
@@ -207,3 +207,10 @@ class LineMap:
             rms_residual_px=self.rms_residual_px,
             sigma_m=self.sigma_m,
         )
+
+
+def _require_partition(offsets: IntArray, count: int, name: str) -> None:
+    """Raise ValueError unless offsets rise from 0 to count and so cut `count` rows into ranges."""
+    sound = len(offsets) > 0 and offsets[0] == 0 and offsets[-1] == count
+    if not (sound and (np.diff(offsets) >= 0).all()):
+        raise ValueError(f"{name}: expected a non-decreasing partition of {count} rows")
