@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,8 +42,12 @@ class EventColumns:
             yield EventColumns(t_us=self.t_us[part], x=self.x[part], y=self.y[part], p=self.p[part])
 
 
+# A recording as it is read, front to back; closing it closes the file.
+ColumnBlocks = Generator[EventColumns, None, None]
+
+
 def checked_streams(
-    blocks: Iterable[EventColumns], *, t_offset_us: int, width: int, height: int, subject: str
+    blocks: ColumnBlocks, *, t_offset_us: int, width: int, height: int, subject: str
 ) -> Iterator[EventStream]:
     """Check consecutive columns, across their borders too, and bring them on the pose clock.
 
@@ -60,8 +65,9 @@ def checked_streams(
     first = 0
     previous_us = -MAX_TIME_US
     negative: int | None = None
-    for block in blocks:
-        for columns in block.pieces():
+    # Closed here: an error would keep the file open for as long as its traceback lives.
+    with closing(blocks):
+        for columns in (piece for block in blocks for piece in block.pieces()):
             t_us = columns.t_us.astype(np.int64)
             _check_times(t_us, previous_us, first, subject)
             _check_bounds("x", columns.x, width, first, subject)
@@ -104,9 +110,9 @@ def _check_bounds(name: str, column: Array, size: int, first: int, subject: str)
 
 
 def _negative_value(p: Array) -> int | None:
-    """How the recording writes a negative event, 0 or -1; None while it has shown none."""
-    lowest = int(p.min())
-    return None if lowest == 1 else lowest
+    """How the recording writes a negative event, told by the first; None while there is none."""
+    negative = p != 1
+    return int(p[np.argmax(negative)]) if negative.any() else None
 
 
 def _signs(p: Array, negative: int | None, first: int, subject: str) -> Array:

@@ -13,7 +13,12 @@ import numpy as np
 
 from roel_service.arrays import Array, IntArray
 from roel_service.errors import EventsError
-from roel_service.io.event_columns import CHUNK_EVENT_COUNT, EventColumns, no_events
+from roel_service.io.event_columns import (
+    CHUNK_EVENT_COUNT,
+    ColumnBlocks,
+    EventColumns,
+    no_events,
+)
 from roel_service.io.files import whole_file
 from roel_service.io.text import MAX_TIME_US
 from roel_service.scene.events import EventStream
@@ -69,7 +74,7 @@ class Hdf5Events:
                 time_range_us=(first_us, last_us),
             )
 
-    def blocks(self) -> Iterator[EventColumns]:
+    def blocks(self) -> ColumnBlocks:
         """The columns front to back; a block holds whole stored chunks, so each is read once."""
         with _datasets(self.path, self.subject) as (columns, _):
             stored = max((column.chunks or (1,))[0] for column in columns.values())

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roel_service.errors import EventsError
-from roel_service.io.event_columns import CHUNK_EVENT_COUNT, EventColumns, no_events
+from roel_service.io.event_columns import (
+    CHUNK_EVENT_COUNT,
+    ColumnBlocks,
+    EventColumns,
+    no_events,
+)
 from roel_service.io.npz import NpzMember, open_members
 
 _NAMES = ("t", "x", "y", "p")
@@ -43,7 +48,7 @@ class NpzEvents:
             raise no_events(subject)
         return NpzEvents(path=path, subject=subject, event_count=event_count)
 
-    def blocks(self) -> Iterator[EventColumns]:
+    def blocks(self) -> ColumnBlocks:
         """The columns front to back."""
         with _columns(self.path, self.subject) as columns:
             for start in range(0, self.event_count, CHUNK_EVENT_COUNT):

@@ -7,7 +7,6 @@ column, and microseconds when all of that column is written as integers.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.errors import EventsError
-from roel_service.io.event_columns import EventColumns
+from roel_service.io.event_columns import ColumnBlocks, EventColumns
 from roel_service.io.files import open_input
 from roel_service.io.text import (
     MAX_TIME_US,
@@ -45,7 +44,7 @@ class TextEvents:
     event_count: None = None
     time_range_us: None = None
 
-    def blocks(self) -> Iterator[EventColumns]:
+    def blocks(self) -> ColumnBlocks:
         """The events front to back, about 16 MB of text at a time.
 
         Raises:

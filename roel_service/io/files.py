@@ -53,14 +53,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
         InputError: nothing can be written there.
     """
-    target = Path(os.path.realpath(path))  # a symbolic link stays one
-    if target.exists() and not target.is_file():
-        raise InputError(str(path), "a file to write", "a folder or device of that name")
-    temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
-    try:
-        temporary.touch(exist_ok=False)
-    except (OSError, ValueError) as error:
-        raise InputError(str(path), "a file to write", _reason(error)) from error
+    target, temporary = _create_sibling(path)
     try:
         yield temporary
         _flush(temporary)
@@ -68,6 +61,19 @@ def whole_file(path: Path) -> Iterator[Path]:
         _flush(target.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _create_sibling(path: Path) -> tuple[Path, Path]:
+    """The file to replace and an empty temporary one beside it."""
+    try:
+        target = Path(os.path.realpath(path))  # a symbolic link stays one
+        if target.exists() and not target.is_file():
+            raise InputError(str(path), "a file to write", "a folder or device of that name")
+        temporary = target.with_name(f".{secrets.token_hex(8)}{target.suffix}")
+        temporary.touch(exist_ok=False)
+    except (OSError, ValueError) as error:
+        raise InputError(str(path), "a file to write", _reason(error)) from error
+    return target, temporary
 
 
 def _flush(path: Path) -> None:

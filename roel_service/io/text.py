@@ -18,7 +18,8 @@ BLOCK_BYTES = 1 << 24
 # microseconds, also after the multiplication by 1e6.
 MAX_TIME_US = 2**31 * 10**6
 
-_DATA = re.compile(rb"^[^\S\n]*[^#\s]", re.MULTILINE)
+# A line that begins with anything printable but a comment.
+_DATA = re.compile(rb"^[^\S\n]*[!\"$-~]", re.MULTILINE)
 
 
 def line_blocks(
@@ -66,15 +67,16 @@ def parse_rows(
         InputError: of type `error`, with the number of the first line that is no such row.
     """
     count = len(columns.split())
-    if not _DATA.search(block):
+    cause = "none"
+    if _DATA.search(block):
+        try:
+            rows = np.loadtxt(io.BytesIO(block), ndmin=2)
+            if rows.shape[1] == count and np.isfinite(rows).all():
+                return np.asarray(rows, dtype=np.float64)
+        except ValueError as failure:
+            cause = str(failure)
+    elif next(_data_lines(block, first_line), None) is None:
         return np.empty((0, count))
-    try:
-        rows = np.loadtxt(io.BytesIO(block), ndmin=2)
-        if rows.shape[1] == count and np.isfinite(rows).all():
-            return np.asarray(rows, dtype=np.float64)
-        cause = "other values"
-    except ValueError as failure:
-        cause = str(failure)
     for line, fields in _data_lines(block, first_line):
         if len(fields) != count or not all(_is_finite_number(field) for field in fields):
             found = b" ".join(fields)[:80].decode("ascii", "replace")
