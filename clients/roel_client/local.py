@@ -6,17 +6,20 @@ Files are named as the user gave them, because errors repeat the name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from roel_client.naming import naming
 
 if TYPE_CHECKING:
     from roel_service.io.events import EventFile
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
     from roel_service.scene.trajectory import Trajectory
+    from roel_service.wire.rlm import MapFile
 
-_RLM_MAGIC = b"RLM1"
+RLM_MAGIC = b"RLM1"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,3 +59,55 @@ def draw_map(line_map: LineMap, recording: Recording, path: Path) -> None:
     from roel_service.evaluation import figures
 
     figures.draw_map(line_map, recording.trajectory, recording.camera, recording.events, path)
+
+
+def read_map_file(name: str) -> MapFile:
+    """Decode a `.rlm` file."""
+    from roel_service.io.files import open_input
+    from roel_service.wire.rlm import decode_map
+
+    with open_input(Path(name)) as file:
+        return decode_map(file.read(), subject=name)
+
+
+def describe_map(name: str) -> dict[str, Any]:
+    """What a map file holds, with the keys of `roel map info`."""
+    map_file = read_map_file(name)
+    return {
+        "format_version": map_file.format_version[0],
+        "line_count": len(map_file.line_map),
+        "total_length_m": float(map_file.line_map.lengths_m.sum()),
+        "bounds_min_m": map_file.bounds_min_m.tolist(),
+        "bounds_max_m": map_file.bounds_max_m.tolist(),
+        "bytes": map_file.byte_count,
+        "digest": map_file.digest,
+        "config_digest": map_file.provenance.config_digest,
+    }
+
+
+def export_map(name: str, path: Path) -> None:
+    """Write a map file in the format that the suffix of `path` names."""
+    from roel_service.io import maps
+
+    maps.export_map(read_map_file(name).line_map, path)
+
+
+def evaluate_map(name: str, mesh: str, edges: str) -> dict[str, Any]:
+    """The figures of `roel evaluate map`; the map is a `.rlm` file or an exported NPZ."""
+    from roel_service.evaluation import maps
+    from roel_service.io.clouds import read_mesh, read_points
+
+    line_map = _read_map(name)
+    surface = read_mesh(Path(mesh))
+    truth = read_points(Path(edges), "edges")
+    with naming({"map": name, "mesh": mesh, "edges": edges}):
+        return asdict(maps.evaluate_map(line_map, surface, truth))
+
+
+def _read_map(name: str) -> LineMap:
+    from roel_service.io.files import open_input
+    from roel_service.io.maps import read_exported_map
+
+    with open_input(Path(name)) as file:
+        is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
+    return read_map_file(name).line_map if is_map_file else read_exported_map(Path(name))

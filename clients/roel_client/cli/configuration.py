@@ -8,6 +8,7 @@ from pathlib import Path
 from roel_client.cli.output import print_text
 from roel_client.cli.parser import Command, Parser, Subparsers, command, command_group, one_of
 from roel_client.cli.staging import Staged
+from roel_client.naming import naming
 from roel_service.config.load import Tables, load_config, to_toml
 from roel_service.config.presets import PRESETS
 from roel_service.config.stages import Config
@@ -35,8 +36,11 @@ def add_config_options(parser: Parser) -> None:
 
 def effective_config(options: argparse.Namespace, overrides: Tables | None = None) -> Config:
     """The preset, changed by `--config`, changed by `overrides` of other options."""
-    path = None if options.config is None else Path(options.config)
-    return load_config(options.preset, path, overrides)
+    if options.config is None:
+        return load_config(options.preset, None, overrides)
+    path = Path(options.config)
+    with naming({path.name: options.config}):
+        return load_config(options.preset, path, overrides)
 
 
 def show_config(options: argparse.Namespace, staged: Staged) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import logging
 import os
 import signal
 import sys
@@ -82,14 +83,15 @@ def answer(work: Callable[[], int], command_line: list[str]) -> int:
         return 128 + signal.SIGPIPE
     except Exception as error:  # the border of the process: whatever is left is a bug
         if isinstance(error, OSError) and error.errno in WRITE_FAULTS:
-            say(f"roel: error: {error.filename or 'output'}: expected room, found {error.strerror}")
+            place = error.filename or "output"
+            say(f"roel: error: {place}: expected a place to write to, found {error.strerror}")
             return UNUSABLE
         return bug("".join(traceback.format_exception(error)), command_line)
 
 
 def bug(what: str, command_line: list[str]) -> int:
     """Report a fault of this program."""
-    if "debug" in (os.environ.get("ROEL_LOG_LEVEL"), *command_line):
+    if logging.getLogger().isEnabledFor(logging.DEBUG):
         sys.stderr.write(what)
     say(f"roel: internal error: crash report in {write_crash_report(command_line, what)}")
     return BUG
