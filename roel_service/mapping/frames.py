@@ -5,7 +5,7 @@ Paper: "Multi-window, Multi-representation Line Detection"; frames are made at f
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -17,7 +17,7 @@ from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3
 from roel_service.mapping import frames_kernels
 from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventSlice, EventSource, EventStream, concatenate
+from roel_service.scene.events import EventSlice, EventStream, concatenate
 from roel_service.scene.trajectory import Trajectory
 
 # Polarity label of an image in which both polarities are drawn.
@@ -86,31 +86,46 @@ class EventImage:
     polarity: int
 
 
+def frame_times(trajectory: Trajectory, from_us: int, config: FramesConfig) -> Iterator[int]:
+    """Times at a fixed rate, in us, whose longest window lies within the poses."""
+    interval_us = round(1e6 / config.rate_hz)
+    reach_us = config.max_half_window_us
+    for first_us, last_us in trajectory.covered_us().tolist():
+        start_us = max(first_us, from_us) + reach_us
+        yield from range(start_us, last_us - reach_us + 1, interval_us)
+
+
 def frame_slices(
-    source: EventSource, trajectory: Trajectory, config: FramesConfig
+    chunks: Iterable[EventStream], trajectory: Trajectory, config: FramesConfig
 ) -> Iterator[tuple[int, EventStream]]:
     """Frame times with the events around each, read once and front to back.
 
-    A frame needs poses over its whole longest window; times without them are passed over. Memory
-    holds one chunk of the source and one window, however long the recording is.
+    Memory holds one chunk and one window, however long the recording is.
+
+    Args:
+        chunks: events in the order of time.
+        trajectory: poses; times they do not cover are passed over.
+        config: rate and longest window.
 
     Yields:
-        (t_us, events within `max_half_window_us` of it).
+        (t_us, a stream that holds the events within `max_half_window_us` of it).
     """
-    interval_us = round(1e6 / config.rate_hz)
     reach_us = config.max_half_window_us
     buffer: EventStream | None = None
-    t_us = None
-    for chunk in source.chunks():
+    times: Iterator[int] = iter(())
+    t_us: int | None = None
+    for chunk in chunks:
         if len(chunk) == 0:
             continue
+        if buffer is None:
+            times = frame_times(trajectory, int(chunk.t_us[0]), config)
+            t_us = next(times, None)
         if t_us is None:
-            t_us = max(int(chunk.t_us[0]), int(trajectory.t_us[0])) + reach_us
+            continue
         buffer = _extended(buffer, chunk, keep_from_us=t_us - reach_us)
-        while t_us + reach_us <= buffer.t_us[-1]:
-            if trajectory.covers(np.array([t_us - reach_us, t_us, t_us + reach_us])).all():
-                yield t_us, buffer
-            t_us += interval_us
+        while t_us is not None and t_us + reach_us <= buffer.t_us[-1]:
+            yield t_us, buffer
+            t_us = next(times, None)
 
 
 def _extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: int) -> EventStream:

@@ -1,28 +1,24 @@
-"""Lines of distant frames that belong together.
+"""Lines collect their observations from all frames.
 
-Paper: "Local and Global Line Matching", the global part. Two methods:
-
-- `reassociate`: triangulated lines are projected into every frame, take up what fits there, and
-  are refined again, in rounds of shrinking distance (`docs/paper_map.md`, deviation).
-- `sampled`: the paper's scheme. Frames are sampled, each is matched against its nearest ones, and
-  tracks with corresponding lines are joined. Correspondences come from a `LineMatcher`.
+Paper: "Local and Global Line Matching", the global part, by geometry in place of a learned matcher:
+triangulated lines are projected into every frame, take up what fits there, and are refined again,
+in rounds of shrinking distance. The paper's own scheme is in `match_sampled`.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from scipy import sparse
 
-from roel_service.arrays import FloatArray, IntArray
-from roel_service.config.stages import MatchGlobalConfig, RefineConfig
+from roel_service.arrays import FloatArray
+from roel_service.config.stages import Config, MatchGlobalConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
+from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.refine import Evidence, Refined, refine_lines
+from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.trim import covered_spans
 from roel_service.mapping.views import Views, end_residuals_px
 from roel_service.progress import StepCallback
@@ -43,24 +39,13 @@ COMPETITION_PX = 0.3
 VELOCITY_HALF_STEP_US = 5_000
 
 
-class LineMatcher(Protocol):
-    """Finds the same lines in two frames."""
-
-    def match(self, frame_i: int, frame_j: int) -> IntArray:
-        """(n, 2) observations of frame i and of frame j that show the same line."""
-        ...
-
-
 def reassociate(
     refined: Refined,
     evidence: Evidence,
     observations: LineObservations,
     frames: Frames,
     trajectory: Trajectory,
-    config: MatchGlobalConfig,
-    refine: RefineConfig,
-    *,
-    speed_is_known: bool,
+    config: Config,
     progress: StepCallback,
 ) -> Refined:
     """Let lines collect their observations from all frames, in rounds; then make them exclusive.
@@ -69,22 +54,22 @@ def reassociate(
         refined: first lines with their tracks.
         evidence, observations: of all frames.
         frames, trajectory: poses; the trajectory gives the camera's velocity.
-        config: distances of the rounds and gates.
-        refine: how lines are refined between the rounds.
-        speed_is_known: observed speeds have the camera's rotation undone and can be predicted.
+        config: `match_global` and, for between the rounds, `refine`. Speeds can be predicted where
+            `frames` undoes the camera's rotation.
         progress: called once a round; may raise `Cancelled`.
     """
-    velocity = _velocities(frames, trajectory) if speed_is_known else None
-    round_count = len(config.max_distances_px)
-    for index, max_distance_px in enumerate(config.max_distances_px):
+    settings = config.match_global
+    velocity = _velocities(frames, trajectory) if config.frames.compensate_rotation else None
+    round_count = len(settings.max_distances_px)
+    for index, max_distance_px in enumerate(settings.max_distances_px):
         progress(index, round_count)
         found = _associate(
-            refined, evidence.views, observations, frames, velocity, max_distance_px, config
+            refined, evidence.views, observations, frames, velocity, max_distance_px, settings
         )
-        refined = _usable(refine_lines(refined.lines, found, evidence, frames, refine))
-        refined = _without_shared(refined, len(observations), config.max_shared_fraction)
+        refined = _usable(refine_lines(refined.lines, found, evidence, frames, config.refine))
+        refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
     exclusive = _exclusive(refined, evidence.views, frames)
-    return _usable(refine_lines(refined.lines, exclusive, evidence, frames, refine))
+    return _usable(refine_lines(refined.lines, exclusive, evidence, frames, config.refine))
 
 
 def _usable(refined: Refined) -> Refined:

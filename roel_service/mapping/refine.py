@@ -23,6 +23,7 @@ from roel_service.arrays import Array, BoolArray, FloatArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import grassmann, plucker
 from roel_service.geometry.vectors import dot
+from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.moments import camera_from_world_lines
 from roel_service.mapping.views import Views, cuts_m, end_residuals_px
@@ -39,23 +40,6 @@ FIRST_GATE = 1.5
 LOOSE_ITERATION_COUNT = 2
 # Keeps the 4x4 systems of lines regular that no observation holds in some direction.
 RIDGE = 1e-12
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Evidence:
-    """Everything that is measured about the observations, for the costs.
-
-    Attributes:
-        views: M viewing planes.
-        event_forms: (M, 6, 6) mean of a a^T over the events, camera frame.
-        segment_forms: (M, 6, 6) the same over three points of the segment.
-        event_counts: (M,) events behind each form.
-    """
-
-    views: Views
-    event_forms: FloatArray
-    segment_forms: FloatArray
-    event_counts: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -246,7 +246,7 @@ def _line_map(
 ) -> LineMap:
     """The good pieces, strongest first, without what lies along a stronger one."""
     ends = _ends(refined, pieces)
-    strength = pieces.frame_count * np.sqrt(norm(ends[:, 1] - ends[:, 0]))
+    strength: FloatArray = pieces.frame_count * np.sqrt(norm(ends[:, 1] - ends[:, 0]))
     strength = strength / (SIGMA_FLOOR_M + sigma_m)
     order = np.argsort(-strength, kind="stable")
     order = order[good[order]]

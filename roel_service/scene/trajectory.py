@@ -48,13 +48,18 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t_us)
 
+    def covered_us(self) -> IntArray:
+        """(n, 2) first and last times between which no gap exceeds `MAX_POSE_GAP_US`, in order."""
+        before_gap = np.flatnonzero(np.diff(self.t_us) > MAX_POSE_GAP_US)
+        first = np.concatenate([[0], before_gap + 1])
+        last = np.concatenate([before_gap, [len(self) - 1]])
+        return np.stack([self.t_us[first], self.t_us[last]], axis=1)
+
     def covers(self, t_us: IntArray) -> BoolArray:
         """(K,) whether each time lies within the poses and in no gap above `MAX_POSE_GAP_US`."""
-        t_us = np.asarray(t_us)
-        right = np.clip(np.searchsorted(self.t_us, t_us), 1, len(self.t_us) - 1)
-        gap = self.t_us[right] - self.t_us[right - 1]
-        inside = (t_us >= self.t_us[0]) & (t_us <= self.t_us[-1])
-        return np.asarray(inside & (gap <= MAX_POSE_GAP_US))
+        first, last = self.covered_us().T
+        index = np.searchsorted(first, t_us, side="right") - 1
+        return np.asarray((index >= 0) & (np.asarray(t_us) <= last[index]))
 
     def interpolate(self, t_us: IntArray) -> SE3:
         """(K) poses at (K,) times: position linear, rotation on the shortest arc.

@@ -1,0 +1,60 @@
+"""What the observations say about lines, in the form that the costs use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray
+from roel_service.config.stages import FramesConfig, RefineConfig
+from roel_service.mapping.frames import Frames
+from roel_service.mapping.moments import event_forms, segment_forms
+from roel_service.mapping.views import Views, views_of
+from roel_service.scene.lines import LineObservations
+from roel_service.scene.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Evidence:
+    """Everything that is measured about the observations, for the costs.
+
+    Attributes:
+        views: M viewing planes.
+        event_forms: (M, 6, 6) mean of a a^T over the events, camera frame.
+        segment_forms: (M, 6, 6) the same over three points of the segment.
+        event_counts: (M,) events behind each form.
+    """
+
+    views: Views
+    event_forms: FloatArray
+    segment_forms: FloatArray
+    event_counts: Array
+
+
+def measure_evidence(
+    observations: LineObservations,
+    frames: Frames,
+    trajectory: Trajectory,
+    frames_config: FramesConfig,
+    refine_config: RefineConfig,
+) -> Evidence:
+    """Viewing planes and quadratic forms of all observations.
+
+    Where rotation is compensated each event counts with the pose at its own time, else with that
+    of its frame, as in the paper.
+    """
+    own_poses = trajectory if frames_config.compensate_rotation else None
+    forms = event_forms(
+        observations,
+        frames,
+        own_poses,
+        frames_config.slot_us,
+        refine_config.event_count_per_line,
+    )
+    return Evidence(
+        views=views_of(observations, frames),
+        event_forms=forms,
+        segment_forms=segment_forms(observations, frames),
+        event_counts=np.diff(observations.event_offsets),
+    )

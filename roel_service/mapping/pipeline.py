@@ -1,0 +1,191 @@
+"""RoEL from events to a line map, one call for each stage of the paper."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.config.stages import Config
+from roel_service.mapping.detect import LineDetector, detect_lines, line_detector
+from roel_service.mapping.evidence import Evidence, measure_evidence
+from roel_service.mapping.frames import (
+    Frames,
+    event_frame,
+    event_images,
+    frame_slices,
+    frame_times,
+    frames_at,
+    undistortion_table,
+)
+from roel_service.mapping.in_order import in_order
+from roel_service.mapping.match_global import reassociate
+from roel_service.mapping.match_local import match_adjacent_frames
+from roel_service.mapping.match_sampled import (
+    GeometricMatcher,
+    LineMatcher,
+    match_sampled_frames,
+)
+from roel_service.mapping.merge import merge_duplicates
+from roel_service.mapping.plane_fit import (
+    FittedLines,
+    fit_space_time_planes,
+    observations_of_frames,
+)
+from roel_service.mapping.refine import Refined, refine_lines
+from roel_service.mapping.run import CountedEvents, MappingRun
+from roel_service.mapping.triangulate import triangulate_tracks
+from roel_service.mapping.trim import trim_to_segments
+from roel_service.progress import ProgressCallback, ignore
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventSource, EventStream
+from roel_service.scene.lines import LineObservations, LineTracks
+from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
+from roel_service.scene.trajectory import Trajectory
+
+
+def build_line_map(
+    events: EventSource,
+    trajectory: Trajectory,
+    camera: Camera,
+    config: Config,
+    *,
+    detector: LineDetector | None = None,
+    matcher: LineMatcher | None = None,
+    progress: ProgressCallback = ignore,
+) -> MappingResult:
+    """Reconstruct a 3D line map from events and known poses.
+
+    Args:
+        events: read once, front to back.
+        trajectory: poses on the clock of the events; what they do not cover is left out.
+        camera: calibration of the sensor.
+        config: parameters of every stage, and the seed.
+        detector: takes the place of the configured one.
+        matcher: finds correspondences for `match_global.method = "sampled"`; geometric by default.
+        progress: called often; may raise `Cancelled`.
+
+    Raises:
+        EventsError: no events.
+        TrajectoryError: poses that cover less than a tenth of the recording.
+        Cancelled: as raised by `progress`.
+    """
+    run = MappingRun(progress)
+    rng = np.random.default_rng(config.runtime.seed)
+    counted = CountedEvents(events, trajectory)
+    detector = detector or line_detector(config.detect)
+
+    frames, observations = _lines_of_all_frames(counted, trajectory, camera, config, detector, run)
+    counted.check_coverage()
+    with run.stage("match_local"):
+        tracks = match_adjacent_frames(observations, frames, config.match_local)
+        evidence = measure_evidence(observations, frames, trajectory, config.frames, config.refine)
+    if config.match_global.method == "sampled":
+        with run.stage("match_global"):
+            matcher = matcher or GeometricMatcher(tracks, evidence.views, frames, config)
+            tracks = match_sampled_frames(tracks, evidence.views, frames, config, matcher, run.step)
+    with run.stage("triangulate"):
+        refined = _triangulate(tracks, evidence, frames, config, rng, run)
+    if config.match_global.method == "reassociate":
+        with run.stage("match_global"):
+            refined = reassociate(
+                refined, evidence, observations, frames, trajectory, config, run.step
+            )
+    with run.stage("refine"):
+        refined = run.without_diverged(
+            refine_lines(refined.lines, refined.tracks, evidence, frames, config.refine)
+        )
+    with run.stage("trim"):
+        line_map, dropped = trim_to_segments(refined, evidence.views, frames, config.trim)
+        run.count(dropped)
+    run.count([TrackStatus.TRIANGULATED] * len(line_map))
+    return MappingResult(
+        line_map=line_map,
+        trajectory=trajectory,
+        report=MappingReport(
+            frame_count=len(frames),
+            event_count=counted.covered_count,
+            left_out_event_count=counted.total_count - counted.covered_count,
+            observation_count=len(observations),
+            track_status_count=dict(run.statuses),
+            seconds=run.seconds,
+        ),
+    )
+
+
+def _triangulate(
+    tracks: LineTracks,
+    evidence: Evidence,
+    frames: Frames,
+    config: Config,
+    rng: np.random.Generator,
+    run: MappingRun,
+) -> Refined:
+    """First 3D lines, refined over their inliers and, if configured, without duplicates."""
+    found = triangulate_tracks(tracks, evidence.views, frames, config.triangulate, rng)
+    run.count([status for status in found.statuses if status is not TrackStatus.TRIANGULATED])
+    refined = run.without_diverged(
+        refine_lines(found.lines, found.tracks, evidence, frames, config.refine)
+    )
+    if not config.triangulate.merge:
+        return refined
+    refined, merged = merge_duplicates(refined, evidence.views, frames, config.triangulate)
+    run.count(merged)
+    return refined
+
+
+def _lines_of_all_frames(
+    events: CountedEvents,
+    trajectory: Trajectory,
+    camera: Camera,
+    config: Config,
+    detector: LineDetector,
+    run: MappingRun,
+) -> tuple[Frames, LineObservations]:
+    """Detection and plane fit of every frame; frames are independent and run in threads."""
+    ideal_px = undistortion_table(camera)
+
+    def lines_of_frame(item: tuple[int, tuple[int, EventStream]]) -> _FrameLines:
+        index, (t_us, stream) = item
+        started = time.perf_counter()
+        frame = event_frame(
+            stream, t_us, ideal_px, trajectory, camera, config.frames, config.detect
+        )
+        seeds = detect_lines(event_images(frame, config.detect), detector, config.detect)
+        detected = time.perf_counter()
+        rng = np.random.default_rng(np.random.SeedSequence(config.runtime.seed, spawn_key=(index,)))
+        fitted = fit_space_time_planes(seeds, frame, config.plane_fit, rng)
+        return _FrameLines(
+            t_us=t_us,
+            fitted=fitted,
+            detect_s=detected - started,
+            plane_fit_s=time.perf_counter() - detected,
+        )
+
+    expected_count = sum(1 for _ in frame_times(trajectory, 0, config.frames))
+    began = time.perf_counter()
+    slices = enumerate(frame_slices(events.chunks(), trajectory, config.frames))
+    worker_count = config.runtime.worker_count or os.cpu_count() or 1
+    done: list[_FrameLines] = []
+    for lines in in_order(lines_of_frame, slices, worker_count):
+        done.append(lines)
+        run.step(len(done), max(len(done), expected_count))
+    run.share_wall_clock(
+        time.perf_counter() - began,
+        {
+            "detect": sum(lines.detect_s for lines in done),
+            "plane_fit": sum(lines.plane_fit_s for lines in done),
+        },
+    )
+    frames = frames_at(np.array([lines.t_us for lines in done], np.int64), trajectory, camera)
+    return frames, observations_of_frames([lines.fitted for lines in done])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _FrameLines:
+    t_us: int
+    fitted: FittedLines
+    detect_s: float
+    plane_fit_s: float
