@@ -64,7 +64,7 @@ class TextEvents:
         integers = rows[:, 1:] if is_seconds else rows
         odd = ((integers != np.rint(integers)) | (np.abs(integers) > _MAX_INTEGER)).any(axis=1)
         if is_seconds:
-            odd |= np.abs(rows[:, 0]) * 1e6 > MAX_TIME_US
+            odd |= np.abs(rows[:, 0]) > MAX_TIME_US / 1e6
         if odd.any():
             row = int(np.argmax(odd))
             unit = "seconds" if is_seconds else "integer microseconds"

@@ -27,7 +27,7 @@ _DAMAGE = (
 # The header that numpy writes, for plain numbers. Parsed here and not by numpy, whose parser
 # evaluates literals and so fails in as many ways as Python's own.
 _HEADER = re.compile(
-    rb"\{'descr': '([<>|]?[biuf][1248])', 'fortran_order': (False|True), "
+    rb"\{'descr': '([<>|]?(?:[iu][1248]|f[248]|b1))', 'fortran_order': (False|True), "
     rb"'shape': \(((?:\d{1,18}(?:, ?|(?=\))))*)\),? *\} *\n"
 )
 _MAX_HEADER_BYTES = 4096

@@ -200,7 +200,7 @@ class TestText:
             ("nan 1 2 0", "line 3"),
             ("0.5 1.5 2 0", "line 3"),
             ("0.5 1e300 2 0", "line 3"),
-            ("1e12 1 2 0", "line 3"),
+            ("1e308 1 2 0", "line 3"),
         ],
     )
     def test_malformed_line_is_named(self, tmp_path, line, message):

@@ -1,0 +1,110 @@
+import logging
+
+import numpy as np
+import pytest
+import trimesh
+
+from roel_service.errors import CloudError, InputError, MeshError
+from roel_service.io.clouds import read_mesh, read_points, write_npz
+
+
+@pytest.fixture
+def triangles():
+    return np.random.default_rng(0).normal(size=(5, 3, 3))
+
+
+@pytest.fixture
+def points():
+    return np.random.default_rng(1).normal(size=(7, 3))
+
+
+def test_mesh_from_npz(tmp_path, triangles):
+    write_npz(tmp_path / "m.npz", triangles=triangles, edges=triangles[0])
+    mesh = read_mesh(tmp_path / "m.npz")
+    np.testing.assert_array_equal(mesh.triangles, triangles.astype(np.float32))
+
+
+def test_mesh_from_ply_whatever_its_name(tmp_path):
+    box = trimesh.creation.box()
+    (tmp_path / "m.npz").write_bytes(box.export(file_type="ply"))
+    np.testing.assert_array_equal(read_mesh(tmp_path / "m.npz").triangles, box.triangles)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"edges": np.zeros((3, 3))}, "an array triangles"),
+        ({"triangles": np.zeros((3, 3))}, "triangles of shape (N, 3, 3)"),
+        ({"triangles": np.zeros(())}, "triangles of shape (N, 3, 3)"),
+        ({"triangles": np.zeros((0, 3, 3))}, "at least one triangle"),
+        ({"triangles": np.full((1, 3, 3), np.nan)}, "finite corners"),
+        ({"triangles": np.full((1, 3, 3), 1e300)}, "finite corners"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(tmp_path, arrays, message):
+    write_npz(tmp_path / "m.npz", **arrays)
+    with pytest.raises(MeshError) as caught:
+        read_mesh(tmp_path / "m.npz")
+    assert message in str(caught.value)
+
+
+def test_ply_without_faces_is_no_mesh(tmp_path, points):
+    (tmp_path / "m.ply").write_bytes(trimesh.PointCloud(points).export(file_type="ply"))
+    with pytest.raises(MeshError, match="expected faces, found none"):
+        read_mesh(tmp_path / "m.ply")
+
+
+def test_points_of_either_key_and_format(tmp_path, points):
+    write_npz(tmp_path / "p.npz", edges=points, points=points[:3])
+    (tmp_path / "p.ply").write_bytes(trimesh.PointCloud(points).export(file_type="ply"))
+    expected = points.astype(np.float32)
+    np.testing.assert_array_equal(read_points(tmp_path / "p.npz", "edges").points, expected)
+    np.testing.assert_array_equal(read_points(tmp_path / "p.npz", "points").points, expected[:3])
+    np.testing.assert_array_equal(read_points(tmp_path / "p.ply", "edges").points, expected)
+
+
+def test_points_that_are_not_finite_are_left_out_with_one_warning(tmp_path, points, caplog):
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    points[1, 2] = np.nan
+    points[4, 0] = 1e300  # beyond float32
+    normals[5, 0] = np.inf
+    write_npz(tmp_path / "p.npz", points=points, normals=normals)
+    with caplog.at_level(logging.WARNING):
+        cloud = read_points(tmp_path / "p.npz", "points")
+    np.testing.assert_array_equal(cloud.points, points[[0, 2, 3, 6]].astype(np.float32))
+    assert cloud.normals.tolist() == [[0, 0, 1]] * 4
+    assert [record.message for record in caplog.records] == [
+        f"{tmp_path / 'p.npz'}: left out 3 points that are not finite"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"edges": np.zeros((3, 3))}, "an array points"),
+        ({"points": np.zeros((3, 2))}, "points of shape (N, 3)"),
+        ({"points": np.zeros((3, 3), bool)}, "points of shape (N, 3)"),
+        ({"points": np.full((3, 3), np.inf)}, "at least 1 finite points"),
+        ({"points": np.zeros((3, 3)), "normals": np.zeros((2, 3))}, "normals of shape (3, 3)"),
+    ],
+)
+def test_what_are_no_points_is_refused(tmp_path, arrays, message):
+    write_npz(tmp_path / "p.npz", **arrays)
+    with pytest.raises(CloudError) as caught:
+        read_points(tmp_path / "p.npz", "points")
+    assert message in str(caught.value)
+
+
+def test_too_few_points_are_refused(tmp_path, points):
+    write_npz(tmp_path / "p.npz", points=points)
+    with pytest.raises(CloudError, match="at least 8 finite points, found 7"):
+        read_points(tmp_path / "p.npz", "points", min_count=8)
+
+
+@pytest.mark.parametrize("content", [b"", b"ply", b"plywood", b"solid x", b"PK\3\4"])
+def test_other_files_are_refused(tmp_path, content):
+    (tmp_path / "a").write_bytes(content)
+    with pytest.raises(InputError):
+        read_mesh(tmp_path / "a")
+    with pytest.raises(InputError):
+        read_points(tmp_path / "a", "points")
