@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING, Any
 from roel_client.naming import naming
 
 if TYPE_CHECKING:
+    from roel_service.config.stages import Config
     from roel_service.io.events import EventFile
+    from roel_service.jobs.build import BuiltMap
+    from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
     from roel_service.scene.trajectory import Trajectory
@@ -24,20 +27,16 @@ RLM_MAGIC = b"RLM1"
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """An opened recording; events are read when somebody asks for them."""
+    """An opened recording; events are read when somebody asks for them.
+
+    Attributes:
+        names: what the user called the files, by what errors call them.
+    """
 
     events: EventFile
     trajectory: Trajectory
     camera: Camera
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Built:
-    """A finished map: as a file's bytes and as lines, with the report of its build."""
-
-    rlm_bytes: bytes
-    line_map: LineMap
-    report: dict[str, Any]
+    names: dict[str, str]
 
 
 def open_recording(
@@ -51,7 +50,25 @@ def open_recording(
     calibration = read_camera(Path(camera), sensor_size)
     trajectory = read_trajectory(Path(poses))
     source = open_events(Path(events), calibration.width, calibration.height)
-    return Recording(events=source, trajectory=trajectory, camera=calibration)
+    names = {"events": events, "poses": poses, "camera": camera}
+    return Recording(events=source, trajectory=trajectory, camera=calibration, names=names)
+
+
+def build_map(
+    recording: Recording, config: Config, *, server: str | None, progress: ProgressCallback
+) -> BuiltMap:
+    """Build a map in this process, or let a server do it.
+
+    Raises:
+        NoAnswerError: fewer lines than a map needs.
+        RoelError: whatever reading, building and the server raise.
+    """
+    from roel_service.jobs import build
+
+    with naming(recording.names):
+        return build.build_map(
+            recording.events, recording.trajectory, recording.camera, config, progress
+        )
 
 
 def draw_map(line_map: LineMap, recording: Recording, path: Path) -> None:

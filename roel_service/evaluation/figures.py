@@ -62,11 +62,11 @@ def draw_map(
 
     times_us = _times_us(trajectory, events)
     T_world_camera = trajectory.interpolate(times_us)
-    view = _best_view(line_map, camera, times_us, T_world_camera)
+    view = best_view(line_map, camera, times_us, T_world_camera)
     aspect = camera.width / camera.height
     figure = Figure(figsize=(5.2 * (aspect + 1.2), 5.4), dpi=150, layout="constrained")
     over_events, from_above = figure.subplots(1, 2, width_ratios=[aspect, 1])
-    lines = _draw_over_events(over_events, view, camera, _event_image(events, view.t_us))
+    lines = _draw_over_events(over_events, view, camera, event_image(events, view.t_us))
     over_events.set_title(f"{len(line_map)} lines over the events at {view.t_us * 1e-6:.3f} s")
     _draw_from_above(from_above, line_map, T_world_camera, camera, view)
     from_above.set_title("from above, with the camera's path")
@@ -75,7 +75,7 @@ def draw_map(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _View:
+class View:
     """All lines as one camera sees them.
 
     Attributes:
@@ -117,7 +117,7 @@ def _times_us(trajectory: Trajectory, events: EventSource) -> IntArray:
     return np.linspace(start_us, stop_us, PATH_POINT_COUNT).astype(np.int64)
 
 
-def _best_view(line_map: LineMap, camera: Camera, times_us: IntArray, T_world_camera: SE3) -> _View:
+def best_view(line_map: LineMap, camera: Camera, times_us: IntArray, T_world_camera: SE3) -> View:
     """The view with the greatest length of lines in it."""
     limit = _field_limit(camera)
     # Without the two ends, where the window of events would be cut in half.
@@ -143,7 +143,7 @@ def _field_limit(camera: Camera) -> FloatArray:
 
 def _seen_from(
     line_map: LineMap, camera: Camera, limit: FloatArray, t_us: int, T_world_camera: SE3
-) -> _View:
+) -> View:
     segments_camera = T_world_camera.inverse() @ line_map.segments.reshape(-1, 3)
     near_m = NEAR_SHARE * float(np.median(np.linalg.norm(segments_camera, axis=1)))
     clipped = clip_to_depth(segments_camera.reshape(-1, 2, 3), near_m)
@@ -152,7 +152,7 @@ def _seen_from(
     xy = points[..., :2] / points[..., 2:]
     inside = (np.abs(xy) <= limit).all(axis=-1, keepdims=True)
     bent = distort(np.where(inside, xy, np.nan), camera.model, camera.distortion)
-    return _View(
+    return View(
         t_us=t_us,
         T_world_camera=T_world_camera,
         pixels=pixel_from_normalized(bent, camera.matrix),
@@ -160,7 +160,7 @@ def _seen_from(
     )
 
 
-def _event_image(events: EventSource, t_us: int) -> Array:
+def event_image(events: EventSource, t_us: int) -> Array:
     """(height, width, 3) RGB in [0, 1]: the events nearest to a moment, by their last polarity."""
     image = np.ones((events.height, events.width, 3))
     start_us, stop_us = t_us - MAX_HALF_WINDOW_US, t_us + MAX_HALF_WINDOW_US
@@ -182,7 +182,7 @@ def _event_image(events: EventSource, t_us: int) -> Array:
     return image
 
 
-def _draw_over_events(axes: Axes, view: _View, camera: Camera, image: Array) -> Any:
+def _draw_over_events(axes: Axes, view: View, camera: Camera, image: Array) -> Any:
     """Draw the left picture; returns the drawn lines, which carry the colours of depth."""
     from matplotlib.collections import LineCollection
 
@@ -207,19 +207,25 @@ def _depth_range_m(depth_m: FloatArray) -> tuple[float, float]:
 
 
 def _draw_from_above(
-    axes: Axes, line_map: LineMap, T_world_camera: SE3, camera: Camera, view: _View
+    axes: Axes, line_map: LineMap, T_world_camera: SE3, camera: Camera, view: View
 ) -> None:
     """Draw the right picture: lines in the colours of the left one, those not seen there grey."""
     from matplotlib.collections import LineCollection
 
-    plan = _plan_axes(T_world_camera.rotation)
+    plan = plan_axes(T_world_camera.rotation)
     axes.add_collection(
-        LineCollection(list(line_map.segments @ plan), colors=UNSEEN_COLOR, linewidths=0.9)
+        LineCollection(
+            list(line_map.segments @ plan), colors=UNSEEN_COLOR, linewidths=0.9, capstyle="round"
+        )
     )
     seen = view.is_seen
     depth_m = view.depth_m[seen].mean(axis=1)
     lines = LineCollection(
-        list(line_map.segments[seen] @ plan), cmap=DEPTH_COLORS, linewidths=1.6, zorder=2
+        list(line_map.segments[seen] @ plan),
+        cmap=DEPTH_COLORS,
+        linewidths=1.6,
+        capstyle="round",  # an upright line is a dot from above
+        zorder=2,
     )
     lines.set_array(depth_m)
     lines.set_clim(*_depth_range_m(view.pieces[1]))
@@ -232,7 +238,7 @@ def _draw_from_above(
     axes.set_axis_off()
 
 
-def _plan_axes(R_world_camera: FloatArray) -> FloatArray:
+def plan_axes(R_world_camera: FloatArray) -> FloatArray:
     """(3, 2) world directions that point right and up in a picture seen from above.
 
     Above is where the cameras' upward direction is on average, or the world axis near to it.
@@ -259,7 +265,7 @@ def _set_extent(axes: Axes, points: FloatArray) -> None:
     axes.set_aspect("equal")
 
 
-def _draw_field_of_view(axes: Axes, camera: Camera, view: _View, plan: FloatArray) -> None:
+def _draw_field_of_view(axes: Axes, camera: Camera, view: View, plan: FloatArray) -> None:
     """Mark the camera of the left picture: its place and the edges of its view."""
     middle = (camera.height - 1) / 2
     border_px = np.array([[0.0, middle], [camera.width - 1.0, middle]])
@@ -277,13 +283,13 @@ def _draw_scale_bar(axes: Axes) -> None:
     """A bar of a round length, about a fifth of the picture's width."""
     left, right = axes.get_xlim()
     bottom, top = axes.get_ylim()
-    length_m = _round_length((right - left) / 5)
+    length_m = round_length((right - left) / 5)
     x, y = left + 0.02 * (right - left), bottom + 0.01 * (top - bottom)
     axes.plot([x, x + length_m], [y, y], color="black", linewidth=3, solid_capstyle="butt")
     axes.annotate(f"{length_m:g} m", (x, y), xytext=(0, 5), textcoords="offset points")
 
 
-def _round_length(length: float) -> float:
+def round_length(length: float) -> float:
     """The largest 1, 2 or 5 times a power of ten that is not above."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(step * power for step in (1, 2, 5) if step * power <= length * (1 + 1e-9))

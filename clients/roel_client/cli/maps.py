@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,7 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
     """Build a map here or on a server, and write it with its report and picture."""
     from roel_client import local
 
+    started_s = time.perf_counter()
     seed = {} if options.seed is None else {"runtime": {"seed": options.seed}}
     config = effective_config(options, seed)
     recording = local.open_recording(
@@ -83,12 +85,13 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
     )
     with progress_bar() as progress:
         built = local.build_map(recording, config, server=options.server, progress=progress)
+    staged["out"].write_bytes(built.rlm_bytes)
+    report = {**built.report, "seconds_total": time.perf_counter() - started_s}
+    if "report" in staged:
+        staged["report"].write_text(to_json(report) + "\n", encoding="utf-8")
     if "plot" in staged:
         local.draw_map(built.line_map, recording, staged["plot"])
-    staged["out"].write_bytes(built.rlm_bytes)
-    if "report" in staged:
-        staged["report"].write_text(to_json(built.report) + "\n", encoding="utf-8")
-    print_result(built.report, _told(built.report, options.out), as_json=options.json)
+    print_result(report, _told(report, options.out), as_json=options.json)
 
 
 def _told(report: dict[str, Any], out: str) -> str:

@@ -56,10 +56,13 @@ def run_in_child(work: Callable[[], int]) -> int:
     Raises:
         Interrupted: after the child has ended.
     """
+    # Held back around the fork: the child must not meet a signal with its parent's handlers.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     child = os.fork()
     if child == 0:
         _become(work)
     try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
         _, status = os.waitpid(child, 0)
     except Interrupted:
         _stop(child)
@@ -73,6 +76,7 @@ def _become(work: Callable[[], int]) -> NoReturn:
     try:
         for number in ENDING_SIGNALS:
             signal.signal(number, signal.SIG_DFL)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
         code = work()
     finally:
         os._exit(code)
