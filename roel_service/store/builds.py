@@ -57,11 +57,12 @@ class Builds:
 
         Raises:
             NotFoundError: no such map or recording.
-            StateError: STREAM_NOT_FINALIZED.
+            StateError: STREAM_NOT_FINALIZED, or NO_POSES.
         """
         with self._database.write() as connection:
             version_number = get_map(connection, map_id).version_count + 1
-            get_finalized(connection, stream_id)
+            if get_finalized(connection, stream_id).pose_count == 0:
+                raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
             operation = _queued(map_id, version_number, stream_id)
             counted = update(MAP).where(MAP.c.id == map_id)
             connection.execute(counted.values(version_count=version_number))

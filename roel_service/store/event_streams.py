@@ -200,6 +200,13 @@ class EventStreams:
         """The sealed chunks of a finalized recording."""
         return self._blobs.path(record.digest)
 
+    def chunk_lengths(self, record: EventStreamRecord) -> list[int]:
+        """Bytes of every chunk, in order."""
+        of_stream = EVENT_CHUNK.c.stream_uid == record.uid
+        query = select(EVENT_CHUNK.c.length).where(of_stream).order_by(EVENT_CHUNK.c.seq)
+        with self._database.read() as connection:
+            return list(connection.scalars(query))
+
     def pose_files(self, record: EventStreamRecord) -> list[Path]:
         """The pose parts of a recording, in the order of time."""
         with self._database.read() as connection:

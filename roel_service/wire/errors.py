@@ -61,14 +61,21 @@ def status_from_error(error: RoelError | Cancelled) -> status_pb2.Status:
     return status
 
 
-def error_from_status(status: status_pb2.Status) -> RoelError | Cancelled:
-    """The exception that a status tells of, the best guess where it has no details of ours."""
+def error_from_status(
+    status: status_pb2.Status, *, subject: str = "server"
+) -> RoelError | Cancelled:
+    """The exception that a status tells of, the best guess where it has no details of ours.
+
+    Args:
+        status: from a call or an operation.
+        subject: who answered, for a status without details.
+    """
     if status.code == code_pb2.CANCELLED:
         return Cancelled(status.message)
     info = _error_info(status)
     if info is None:
         kind = FALLBACK.get(status.code, RoelError)
-        return kind("server", "an answer", f"{code_pb2.Code.Name(status.code)}: {status.message}")
+        return kind(subject, "an answer", f"{code_pb2.Code.Name(status.code)}: {status.message}")
     kind = KINDS.get(info.metadata["error"], RoelError)
     texts = (info.metadata[key] for key in ("subject", "expected", "found"))
     return kind(*texts, reason=info.reason)

@@ -1,0 +1,142 @@
+"""EventStreamService: recordings arrive."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+from google.protobuf.empty_pb2 import Empty
+
+from roel_service.errors import EventsError, InputError, LimitError
+from roel_service.scene.camera import Camera
+from roel_service.service.paging import page_of, page_request
+from roel_service.service.records import event_stream_to_proto
+from roel_service.service.settings import Settings
+from roel_service.store.event_streams import Chunk, EventStreams, PosePart
+from roel_service.store.records import EventStreamRecord
+from roel_service.v1 import events_pb2, types_pb2
+from roel_service.wire import names
+from roel_service.wire.chunks import decode_chunk
+from roel_service.wire.nouns import camera_from_proto, trajectory_from_proto, trajectory_to_proto
+
+POSE_BYTES = 8 * (1 + 3 + 9)
+
+
+class EventStreamServicer:
+    """Decodes requests, calls the store in a thread, encodes answers."""
+
+    def __init__(self, streams: EventStreams, settings: Settings) -> None:
+        self._streams = streams
+        self._settings = settings
+
+    async def CreateEventStream(
+        self, request: events_pb2.CreateEventStreamRequest, context: Any
+    ) -> events_pb2.EventStream:
+        names.check_parent(request.parent)
+        stream_id = names.checked_id(request.event_stream_id, "event_stream_id")
+        camera = camera_from_proto(request.event_stream.camera)
+        record = await asyncio.to_thread(self._streams.create, stream_id, camera)
+        return event_stream_to_proto(record)
+
+    async def AppendEvents(
+        self, requests: AsyncIterator[events_pb2.AppendEventsRequest], context: Any
+    ) -> events_pb2.EventStream:
+        stream_id = await _stream_id(requests)
+        record = await asyncio.to_thread(self._streams.get, stream_id)
+        pending: list[Chunk] = []
+        async for request in requests:
+            message = _part(request, "chunk").chunk
+            pending.append(await asyncio.to_thread(_checked_chunk, message, record.camera))
+            if sum(len(chunk.data) for chunk in pending) >= self._settings.commit_bytes:
+                record = await self._commit(stream_id, pending)
+                pending = []
+        return event_stream_to_proto(await self._commit(stream_id, pending))
+
+    async def AppendPoses(
+        self, requests: AsyncIterator[events_pb2.AppendPosesRequest], context: Any
+    ) -> events_pb2.EventStream:
+        stream_id = await _stream_id(requests)
+        parts: list[types_pb2.Trajectory] = []
+        size_bytes = 0
+        async for request in requests:
+            parts.append(_part(request, "poses").poses)
+            size_bytes += parts[-1].ByteSize()
+            if size_bytes > POSE_BYTES * self._settings.pose_count + 4096:
+                expected = f"at most {self._settings.pose_count}"
+                raise LimitError("poses", expected, "more", reason="TOO_MANY_POSES")
+        record = await asyncio.to_thread(self._append_poses, stream_id, parts)
+        return event_stream_to_proto(record)
+
+    async def FinalizeEventStream(
+        self, request: events_pb2.FinalizeEventStreamRequest, context: Any
+    ) -> events_pb2.EventStream:
+        stream_id = names.event_stream_id(request.name)
+        return event_stream_to_proto(await asyncio.to_thread(self._streams.finalize, stream_id))
+
+    async def GetEventStream(
+        self, request: events_pb2.GetEventStreamRequest, context: Any
+    ) -> events_pb2.EventStream:
+        stream_id = names.event_stream_id(request.name)
+        return event_stream_to_proto(await asyncio.to_thread(self._streams.get, stream_id))
+
+    async def ListEventStreams(
+        self, request: events_pb2.ListEventStreamsRequest, context: Any
+    ) -> events_pb2.ListEventStreamsResponse:
+        names.check_parent(request.parent)
+        wanted = page_request("eventStreams", request.page_size, request.page_token)
+        page = await asyncio.to_thread(page_of, wanted, self._streams.page, lambda item: item.id)
+        return events_pb2.ListEventStreamsResponse(
+            event_streams=[event_stream_to_proto(item) for item in page.items],
+            next_page_token=page.next_page_token,
+        )
+
+    async def DeleteEventStream(
+        self, request: events_pb2.DeleteEventStreamRequest, context: Any
+    ) -> Empty:
+        await asyncio.to_thread(self._streams.delete, names.event_stream_id(request.name))
+        return Empty()
+
+    async def _commit(self, stream_id: str, chunks: list[Chunk]) -> EventStreamRecord:
+        limit = self._settings.event_stream_bytes
+        return await asyncio.to_thread(self._streams.append_chunks, stream_id, chunks, limit)
+
+    def _append_poses(self, stream_id: str, parts: list[types_pb2.Trajectory]) -> EventStreamRecord:
+        trajectory = trajectory_from_proto(*parts)
+        part = PosePart(
+            t0_us=int(trajectory.t_us[0]),
+            t1_us=int(trajectory.t_us[-1]),
+            pose_count=len(trajectory),
+            data=trajectory_to_proto(trajectory).SerializeToString(deterministic=True),
+        )
+        return self._streams.append_poses(stream_id, part, self._settings.pose_count)
+
+
+async def _stream_id(requests: AsyncIterator[Any]) -> str:
+    """The recording that the first message of an upload names."""
+    async for request in requests:
+        return names.event_stream_id(_part(request, "event_stream").event_stream)
+    raise InputError("upload", "a message that names the recording", "none")
+
+
+def _part(request: Any, name: str) -> Any:
+    found = request.WhichOneof("part")
+    if found != name:
+        raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
+    return request
+
+
+def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:
+    """Decode a chunk to know that it is sound; the order of chunks is the store's to check."""
+    events = decode_chunk(message.data, previous_t1_us=None)
+    if (events.width, events.height) != (camera.width, camera.height):
+        expected = f"events of a {camera.width}x{camera.height} sensor, as the camera's"
+        found = f"{events.width}x{events.height}"
+        raise EventsError(f"chunk {message.seq}", expected, found, reason="SENSOR_MISMATCH")
+    return Chunk(
+        seq=message.seq,
+        t0_us=int(events.t_us[0]),
+        t1_us=int(events.t_us[-1]),
+        event_count=len(events),
+        data=message.data,
+    )

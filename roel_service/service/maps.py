@@ -1,0 +1,119 @@
+"""MapService: maps are built, looked up and fetched."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from functools import partial
+from typing import Any
+
+from google.longrunning import operations_pb2
+from google.protobuf.empty_pb2 import Empty
+
+from roel_service.config.stages import Config
+from roel_service.jobs.inputs import BuildParameters
+from roel_service.jobs.scheduler import Scheduler
+from roel_service.jobs.task import TaskSpec
+from roel_service.service.paging import page_of, page_request
+from roel_service.service.records import map_to_proto, map_version_to_proto, operation_to_proto
+from roel_service.service.settings import Settings
+from roel_service.store.records import MapVersionRecord, OperationRecord
+from roel_service.store.store import Store
+from roel_service.v1 import maps_pb2
+from roel_service.wire import names
+from roel_service.wire.configs import config_from_proto
+
+DEFAULT_PRESET = "default"
+
+
+class MapServicer:
+    """Decodes requests, calls store or scheduler, encodes answers."""
+
+    def __init__(self, store: Store, scheduler: Scheduler, settings: Settings) -> None:
+        self._store = store
+        self._scheduler = scheduler
+        self._settings = settings
+
+    async def CreateMap(self, request: maps_pb2.CreateMapRequest, context: Any) -> maps_pb2.Map:
+        names.check_parent(request.parent)
+        map_id = names.checked_id(request.map_id, "map_id")
+        return map_to_proto(await asyncio.to_thread(self._store.maps.create, map_id))
+
+    async def GetMap(self, request: maps_pb2.GetMapRequest, context: Any) -> maps_pb2.Map:
+        map_id = names.map_id(request.name)
+        return map_to_proto(await asyncio.to_thread(self._store.maps.get, map_id))
+
+    async def ListMaps(
+        self, request: maps_pb2.ListMapsRequest, context: Any
+    ) -> maps_pb2.ListMapsResponse:
+        names.check_parent(request.parent)
+        wanted = page_request("maps", request.page_size, request.page_token)
+        fetch = self._store.maps.page
+        page = await asyncio.to_thread(page_of, wanted, fetch, lambda item: item.id)
+        return maps_pb2.ListMapsResponse(
+            maps=[map_to_proto(item) for item in page.items],
+            next_page_token=page.next_page_token,
+        )
+
+    async def DeleteMap(self, request: maps_pb2.DeleteMapRequest, context: Any) -> Empty:
+        await asyncio.to_thread(self._store.maps.delete, names.map_id(request.name))
+        return Empty()
+
+    async def BuildMap(
+        self, request: maps_pb2.BuildMapRequest, context: Any
+    ) -> operations_pb2.Operation:
+        map_id = names.map_id(request.parent)
+        stream_id = names.event_stream_id(request.event_stream)
+        config = config_from_proto(request.config, request.preset or DEFAULT_PRESET)
+        record = await self._scheduler.submit(partial(self._begin, map_id, stream_id, config))
+        return operation_to_proto(record, None)
+
+    async def GetMapVersion(
+        self, request: maps_pb2.GetMapVersionRequest, context: Any
+    ) -> maps_pb2.MapVersion:
+        return map_version_to_proto(await self._version(request.name))
+
+    async def ListMapVersions(
+        self, request: maps_pb2.ListMapVersionsRequest, context: Any
+    ) -> maps_pb2.ListMapVersionsResponse:
+        map_id = names.map_id(request.parent)
+        scope = f"{request.parent}/versions"
+        wanted = page_request(scope, request.page_size, request.page_token)
+        fetch = partial(self._version_page, map_id)
+        page = await asyncio.to_thread(page_of, wanted, fetch, lambda item: str(item.version))
+        return maps_pb2.ListMapVersionsResponse(
+            map_versions=[map_version_to_proto(item) for item in page.items],
+            next_page_token=page.next_page_token,
+        )
+
+    async def DownloadMap(
+        self, request: maps_pb2.DownloadMapRequest, context: Any
+    ) -> AsyncIterator[maps_pb2.DownloadMapResponse]:
+        record = await self._version(request.name)
+        data = await asyncio.to_thread(self._store.maps.map_file, record)
+        size = self._settings.download_part_bytes
+        for start in range(0, len(data), size):
+            yield maps_pb2.DownloadMapResponse(data=data[start : start + size])
+
+    async def _version(self, name: str) -> MapVersionRecord:
+        return await asyncio.to_thread(self._store.maps.version, *names.map_version_id(name))
+
+    def _version_page(self, map_id: str, after: str, limit: int) -> Sequence[MapVersionRecord]:
+        return self._store.maps.version_page(map_id, int(after or 0), limit)
+
+    def _begin(
+        self, map_id: str, stream_id: str, config: Config
+    ) -> tuple[OperationRecord, TaskSpec]:
+        """Record the build; from then on nobody can delete its recording."""
+        operation = self._store.builds.begin(map_id, stream_id)
+        streams = self._store.event_streams
+        stream = streams.get(stream_id)
+        parameters = BuildParameters(
+            event_file=streams.event_file(stream),
+            chunk_lengths=streams.chunk_lengths(stream),
+            pose_files=streams.pose_files(stream),
+            camera=stream.camera,
+            config=config,
+        )
+        entrypoint = self._settings.build_entrypoint
+        return operation, TaskSpec(entrypoint=entrypoint, parameters=parameters)

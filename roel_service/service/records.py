@@ -1,0 +1,118 @@
+"""Rows of the store as messages."""
+
+from __future__ import annotations
+
+import numpy as np
+from google.longrunning import operations_pb2
+from google.protobuf.timestamp_pb2 import Timestamp
+from google.rpc import status_pb2
+
+from roel_service.errors import Cancelled
+from roel_service.store.records import (
+    EventStreamRecord,
+    MapRecord,
+    MapVersionRecord,
+    OperationRecord,
+    OperationState,
+    StreamState,
+    VersionState,
+)
+from roel_service.v1 import events_pb2, maps_pb2, types_pb2
+from roel_service.wire import names
+from roel_service.wire.errors import status_from_error
+from roel_service.wire.nouns import bounds_to_proto, camera_to_proto
+from roel_service.wire.results import report_to_proto
+
+_STREAM_STATES = {
+    StreamState.OPEN: events_pb2.EventStream.STATE_OPEN,
+    StreamState.FINALIZED: events_pb2.EventStream.STATE_FINALIZED,
+}
+
+_VERSION_STATES = {
+    VersionState.CREATING: maps_pb2.MapVersion.STATE_CREATING,
+    VersionState.ACTIVE: maps_pb2.MapVersion.STATE_ACTIVE,
+    VersionState.FAILED: maps_pb2.MapVersion.STATE_FAILED,
+}
+
+
+def event_stream_to_proto(record: EventStreamRecord) -> events_pb2.EventStream:
+    """A recording."""
+    return events_pb2.EventStream(
+        name=names.event_stream_name(record.id),
+        state=_STREAM_STATES[record.state],
+        camera=camera_to_proto(record.camera),
+        chunk_count=record.chunk_count,
+        event_count=record.event_count,
+        size_bytes=record.size_bytes,
+        start_us=record.start_us,
+        end_us=record.end_us,
+        pose_count=record.pose_count,
+        digest=record.digest,
+        create_time=_timestamp(record.create_time_us),
+    )
+
+
+def map_to_proto(record: MapRecord) -> maps_pb2.Map:
+    """A map."""
+    return maps_pb2.Map(
+        name=names.map_name(record.id),
+        version_count=record.version_count,
+        create_time=_timestamp(record.create_time_us),
+    )
+
+
+def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
+    """A version; what only an ACTIVE one has is left out of the others."""
+    message = maps_pb2.MapVersion(
+        name=names.map_version_name(record.map_id, record.version),
+        state=_VERSION_STATES[record.state],
+        event_stream=names.event_stream_name(record.event_stream_id),
+        operation=names.operation_name(record.operation_id),
+        create_time=_timestamp(record.create_time_us),
+    )
+    if record.state is VersionState.ACTIVE:
+        blob = types_pb2.BlobRef(sha256=record.sha256, size_bytes=record.size_bytes)
+        corners = np.array(record.bounds_m).reshape(2, 3)
+        message.map.CopyFrom(blob)
+        message.line_count = record.line_count
+        message.bounds.CopyFrom(bounds_to_proto(corners[0], corners[1]))
+        message.report.CopyFrom(report_to_proto(record.report))
+    return message
+
+
+def operation_to_proto(
+    record: OperationRecord, version: MapVersionRecord | None
+) -> operations_pb2.Operation:
+    """An operation; one that SUCCEEDED answers with the version it built."""
+    operation = operations_pb2.Operation(
+        name=names.operation_name(record.id), done=record.state.is_final
+    )
+    operation.metadata.Pack(_metadata(record))
+    if record.state is OperationState.CANCELLED:
+        operation.error.CopyFrom(status_from_error(Cancelled()))
+    elif record.state is OperationState.FAILED:
+        operation.error.CopyFrom(status_pb2.Status.FromString(record.error))
+    elif version is not None:
+        operation.response.Pack(map_version_to_proto(version))
+    return operation
+
+
+def _metadata(record: OperationRecord) -> maps_pb2.BuildMapMetadata:
+    metadata = maps_pb2.BuildMapMetadata(
+        map_version=names.map_version_name(record.map_id, record.version),
+        stage=record.stage,
+        done_count=record.done_count,
+        total_count=record.total_count,
+        fraction=record.fraction,
+        update_seq=record.update_seq,
+        create_time=_timestamp(record.create_time_us),
+    )
+    if record.state.is_final:
+        metadata.end_time.CopyFrom(_timestamp(record.end_time_us))
+    return metadata
+
+
+def _timestamp(time_us: int) -> Timestamp:
+    timestamp = Timestamp()
+    timestamp.FromMicroseconds(time_us)
+    return timestamp

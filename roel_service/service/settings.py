@@ -1,0 +1,40 @@
+"""What the operator of a server decides; the limits are told by GetCapabilities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from roel_service.wire.chunks import MAX_CHUNK_EVENT_COUNT
+
+MIB = 2**20
+GIB = 2**30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Limits and times of one server.
+
+    Attributes:
+        message_in_bytes, message_out_bytes: largest request and answer.
+        events_per_chunk: fixed by the format of chunks.
+        event_stream_bytes: largest recording, compressed.
+        pose_count: most poses of a recording.
+        concurrent_builds: children at a time.
+        queued_builds: builds that may wait for a child.
+        commit_bytes: an upload is made durable at least this often.
+        download_part_bytes: size of the messages of a download.
+        drain_grace_s: how long calls may go on after SIGTERM.
+        build_entrypoint: `module:function` of a build, imported in the child alone.
+    """
+
+    message_in_bytes: int = 4 * MIB
+    message_out_bytes: int = 8 * MIB
+    events_per_chunk: int = MAX_CHUNK_EVENT_COUNT
+    event_stream_bytes: int = 10 * GIB
+    pose_count: int = 1_000_000
+    concurrent_builds: int = 2
+    queued_builds: int = 16
+    commit_bytes: int = 8 * MIB
+    download_part_bytes: int = MIB
+    drain_grace_s: float = 2.0
+    build_entrypoint: str = "roel_service.jobs.build:run_build"
