@@ -15,6 +15,9 @@ from roel_service.config.stages import (
 )
 from roel_service.errors import ConfigError
 
+# The paper has no such gate.
+UNLIMITED = 1e6
+
 # Published values and choices; what the paper leaves open is marked in docs/paper_map.md.
 PAPER = Config(
     frames=FramesConfig(compensate_rotation=False),
@@ -30,14 +33,25 @@ PAPER = Config(
         support_half_window_us=25_000,
     ),
     match_local=MatchLocalConfig(
-        predict=False, max_distance_px=5.0, min_overlap=0.0, reach_frame_count=1
+        predict=False, max_distance_px=10.0, min_overlap=0.0, reach_frame_count=1
     ),
-    match_global=MatchGlobalConfig(method="sampled"),
+    match_global=MatchGlobalConfig(method="sampled", max_distances_px=(5.0,)),
     triangulate=TriangulateConfig(gate="grassmann", min_inlier_count=10, merge=True),
     refine=RefineConfig(
-        residual="grassmann", loss="squared", event_weight=1e4, event_count_per_line=50
+        residual="grassmann",
+        loss="squared",
+        event_weight=1e4,
+        event_count_per_line=50,
+        max_residual_px=UNLIMITED,
     ),
-    trim=TrimConfig(method="cluster"),
+    trim=TrimConfig(
+        method="cluster",
+        max_sigma_m=UNLIMITED,
+        max_rms_px=UNLIMITED,
+        min_support_ratio=0.0,
+        min_frame_count=1,
+        overlap_distance_m=0.0,
+    ),
 )
 
 PRESETS = {"default": Config(), "paper": PAPER}

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from roel_service.arrays import FloatArray, IntArray
-from roel_service.config.stages import Config, MatchGlobalConfig
+from roel_service.config.stages import Config, MatchGlobalConfig, TriangulateConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.match_global import project_segments
@@ -22,6 +22,9 @@ from roel_service.mapping.trim import covered_spans
 from roel_service.mapping.views import Views
 from roel_service.progress import StepCallback
 from roel_service.scene.lines import LineTracks
+
+# Provisional lines pass easily: a wrong one finds no correspondences.
+PROVISIONAL = TriangulateConfig(gate="pixel", min_observation_count=2, min_inlier_count=2)
 
 
 class LineMatcher(Protocol):
@@ -41,7 +44,7 @@ class GeometricMatcher:
 
     def __init__(self, tracks: LineTracks, views: Views, frames: Frames, config: Config) -> None:
         rng = np.random.default_rng(config.runtime.seed)
-        found = triangulate_tracks(tracks, views, frames, config.triangulate, rng)
+        found = triangulate_tracks(tracks, views, frames, PROVISIONAL, rng)
         spans_m = covered_spans(found.lines, found.tracks, views)
         self._segments_world = plucker.endpoints_from_plucker(
             found.lines.direction, found.lines.moment, spans_m

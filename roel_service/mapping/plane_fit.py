@@ -131,8 +131,9 @@ def _fit_by_ransac(
         config.inlier_distance_px,
         config.min_inlier_count,
     )
-    fitted = scores > 0
-    return lines[fitted], speeds[fitted], np.full(fitted.sum(), UNKNOWN_POLARITY, np.int8)
+    polarity = np.full(len(lines), UNKNOWN_POLARITY, np.int8)
+    best = _best_first(lines, scores, polarity, config)
+    return lines[best], speeds[best], polarity[best]
 
 
 def _best_first(
