@@ -1,6 +1,7 @@
 # The server as an image: CPU only, non-root, all state under /data.
 #   docker build -t roel .
 #   docker run -v roel-data:/data -p 127.0.0.1:50051:50051 roel
+# Calls are not encrypted: publish the port on loopback or inside a trusted network alone.
 
 FROM python:3.11-slim-bookworm AS build
 # Without this index torch is the CUDA build, which is several gigabytes larger.
@@ -27,4 +28,4 @@ VOLUME /data
 EXPOSE 50051
 # Docker's default stop signal, SIGTERM, drains: open calls end, then the server exits with 0.
 HEALTHCHECK --interval=10s --timeout=5s --start-period=20s CMD ["roel", "health", "--server", "127.0.0.1:50051"]
-CMD ["roel", "serve", "--data", "/data", "--host", "0.0.0.0"]
+CMD ["roel", "serve", "--data", "/data", "--host", "0.0.0.0", "--insecure"]

@@ -6,6 +6,7 @@ Files are named as the user gave them, because errors repeat the name.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +16,6 @@ from roel_client.naming import naming
 if TYPE_CHECKING:
     from roel_service.config.stages import Config
     from roel_service.io.events import EventFile
-    from roel_service.jobs.build import BuiltMap
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
@@ -39,6 +39,14 @@ class Recording:
     names: dict[str, str]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Built:
+    """A finished map as a file's bytes, and the report of its build."""
+
+    rlm_bytes: bytes
+    report: dict[str, Any]
+
+
 def open_recording(
     events: str, poses: str, camera: str, sensor_size: tuple[int, int] | None
 ) -> Recording:
@@ -54,27 +62,41 @@ def open_recording(
     return Recording(events=source, trajectory=trajectory, camera=calibration, names=names)
 
 
-def build_map(
-    recording: Recording, config: Config, *, server: str | None, progress: ProgressCallback
-) -> BuiltMap:
-    """Build a map in this process, or let a server do it.
+def build_map(recording: Recording, config: Config, progress: ProgressCallback) -> Built:
+    """Build a map in this process.
 
     Raises:
         NoAnswerError: fewer lines than a map needs.
-        RoelError: whatever reading, building and the server raise.
+        RoelError: whatever reading and building raise.
     """
     from roel_service.jobs import build
 
     with naming(recording.names):
-        return build.build_map(
+        built = build.build_map(
             recording.events, recording.trajectory, recording.camera, config, progress
         )
+    return Built(rlm_bytes=built.rlm_bytes, report=built.report)
 
 
-def draw_map(line_map: LineMap, recording: Recording, path: Path) -> None:
+def build_map_remotely(
+    recording: Recording, config: Config, server: str, progress: ProgressCallback
+) -> Built:
+    """Let a server build the map; raises as `build_map`, and `UnavailableError`."""
+    from roel_client.client import Client
+
+    with naming(recording.names), Client(server) as client:
+        rlm_bytes, report = client.map_recording(
+            recording.events, recording.trajectory, recording.camera, config, progress
+        )
+    return Built(rlm_bytes=rlm_bytes, report=report)
+
+
+def draw_map(built: Built, recording: Recording, path: Path) -> None:
     """Write the picture of a map."""
     from roel_service.evaluation import figures
+    from roel_service.wire.rlm import decode_map
 
+    line_map = decode_map(built.rlm_bytes).line_map
     figures.draw_map(line_map, recording.trajectory, recording.camera, recording.events, path)
 
 
@@ -128,3 +150,14 @@ def _read_map(name: str) -> LineMap:
     with open_input(Path(name)) as file:
         is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
     return read_map_file(name).line_map if is_map_file else read_exported_map(Path(name))
+
+
+def serve(
+    data: Path, host: str, port: int, *, insecure: bool, on_ready: Callable[[str], None]
+) -> None:
+    """Serve until SIGTERM or SIGINT; `on_ready` is told `HOST:PORT`."""
+    import asyncio
+
+    from roel_service.service import server
+
+    asyncio.run(server.serve(data, host, port, insecure=insecure, on_ready=on_ready))

@@ -39,10 +39,10 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
         str(room / "events.h5"), str(room / "poses.txt"), str(room / "camera.json"), None
     )
     with progress_bar() as progress:
-        built = local.build_map(recording, load_config("default"), server=None, progress=progress)
+        built = local.build_map(recording, load_config("default"), progress)
     (folder / "map.rlm").write_bytes(built.rlm_bytes)
     (folder / "report.json").write_text(to_json(built.report) + "\n", encoding="utf-8")
-    local.draw_map(built.line_map, recording, folder / "map.png")
+    local.draw_map(built, recording, folder / "map.png")
     truth = str(room / "gt.npz")
     figures = local.evaluate_map(str(folder / "map.rlm"), truth, truth)
     picture = None if options.out is None else str(Path(options.out, "map.png"))

@@ -39,7 +39,7 @@ def run(command_line: list[str]) -> int:
     """Parse the command line and run its command, in a child unless it handles signals itself."""
     options = parser().parse_args(command_line)
     command: Command = options.command
-    with logging_to_stderr(log_level(options)) as log:
+    with logging_to_stderr(log_level(options), at_once=not command.in_child) as log:
         if command.in_child:
             return run_staged(command, options, log, command_line)
         command.run(options, {})

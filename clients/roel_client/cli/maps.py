@@ -20,6 +20,7 @@ from roel_client.cli.parser import (
     size,
     suffixed,
 )
+from roel_client.cli.process import interruptible
 from roel_client.cli.staging import Staged
 
 EXPORT_SUFFIXES = (".npz", ".ply", ".obj", ".json", ".csv", ".dxf")
@@ -84,13 +85,18 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
-        built = local.build_map(recording, config, server=options.server, progress=progress)
+        if options.server is None:
+            built = local.build_map(recording, config, progress)
+        else:
+            # A signal must reach the client, which then ends the build on the server too.
+            with interruptible():
+                built = local.build_map_remotely(recording, config, options.server, progress)
     staged["out"].write_bytes(built.rlm_bytes)
     report = {**built.report, "seconds_total": time.perf_counter() - started_s}
     if "report" in staged:
         staged["report"].write_text(to_json(report) + "\n", encoding="utf-8")
     if "plot" in staged:
-        local.draw_map(built.line_map, recording, staged["plot"])
+        local.draw_map(built, recording, staged["plot"])
     print_result(report, _told(report, options.out), as_json=options.json)
 
 

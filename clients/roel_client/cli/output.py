@@ -52,25 +52,25 @@ def say(line: str) -> None:
 
 
 class LogHandler(logging.handlers.MemoryHandler):
-    """Writes to stderr: at once if the user asked for detail, else when the command succeeds.
+    """Writes to stderr: at once, or kept until the command succeeds.
 
     A command that fails says so in exactly one line; warnings must not stand before it.
     """
 
-    def __init__(self, level: str) -> None:
+    def __init__(self, *, at_once: bool) -> None:
         stream = logging.StreamHandler(sys.stderr)
         stream.setFormatter(logging.Formatter("roel: %(levelname)s: %(message)s"))
         super().__init__(sys.maxsize, flushLevel=sys.maxsize, target=stream, flushOnClose=False)
-        self._at_once = level in ("debug", "info")
+        self._at_once = at_once
 
     def shouldFlush(self, record: logging.LogRecord) -> bool:
         return self._at_once
 
 
 @contextmanager
-def logging_to_stderr(level: str) -> Iterator[LogHandler]:
-    """Send the log of every library to stderr, from this level on."""
-    handler = LogHandler(level)
+def logging_to_stderr(level: str, *, at_once: bool = False) -> Iterator[LogHandler]:
+    """Send the log of every library to stderr, from this level on; details come at once."""
+    handler = LogHandler(at_once=at_once or level in ("debug", "info"))
     root = logging.getLogger()
     previous = root.level
     root.addHandler(handler)

@@ -14,7 +14,7 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 # A child that cancels work on a server gets this long before it is killed; the contract gives 2 s
 # for everything.
-GRACE_S = 1.0
+GRACE_S = 1.5
 
 
 class Interrupted(BaseException):
