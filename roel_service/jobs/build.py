@@ -122,8 +122,9 @@ def peak_rss_mib() -> float:
 
 def versions() -> dict[str, str]:
     """Releases of this project, Python and the libraries that calculate."""
-    libraries = {name: version(name) for name in LIBRARIES}
-    return {"roel_service": __version__, "python": platform.python_version(), **libraries}
+    found = {name: version(name) for name in LIBRARIES}
+    found |= {"roel_service": __version__, "python": platform.python_version()}
+    return dict(sorted(found.items()))
 
 
 class _DigestedSource:

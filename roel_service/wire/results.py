@@ -34,7 +34,7 @@ def report_from_proto(message: maps_pb2.BuildReport) -> Report:
         "seconds_total": message.seconds_total,
         "peak_rss_mib": message.peak_rss_mib,
         "config": tables_from_proto(message.config),
-        "versions": dict(message.versions),
+        "versions": dict(sorted(message.versions.items())),
     }
 
 
