@@ -92,11 +92,13 @@ def sample_lines(line_map: LineMap, spacing_m: float = SAMPLE_SPACING_M) -> Floa
     Raises:
         MapFileError: more than `MAX_SAMPLE_COUNT` points.
     """
+    with np.errstate(over="ignore"):  # an infinite length is refused like any long one
+        lengths_m = line_map.lengths_m
     # A millionth of a step is rounding, not another sample.
-    steps = np.maximum(np.ceil(line_map.lengths_m / spacing_m - 1e-6), 1.0)
-    if not (steps + 1).sum() <= MAX_SAMPLE_COUNT:
+    steps = np.maximum(np.ceil(lengths_m / spacing_m - 1e-6), 1.0)
+    if steps.sum() + len(steps) > MAX_SAMPLE_COUNT:
         expected = f"lines of at most {MAX_SAMPLE_COUNT * spacing_m:.0f} m together"
-        raise MapFileError("map", expected, f"{line_map.lengths_m.sum():.0f} m")
+        raise MapFileError("map", expected, f"{lengths_m.sum():.0f} m")
     counts = steps.astype(np.int64) + 1
     line = np.repeat(np.arange(len(line_map)), counts)
     first = np.cumsum(counts) - counts
