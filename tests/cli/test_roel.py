@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,6 +156,43 @@ def test_recording_without_lines_has_no_answer(recording: Recording) -> None:
     assert done.stderr.startswith("roel: no answer: ")
     assert done.stderr.count("\n") == 1
     assert not (recording.folder / "map.rlm").exists()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[str]:
+    """Address of a server that runs as a process; it has to end with 0."""
+    process = subprocess.Popen(
+        [ROEL, "serve", "--data", "data", "--port", "0"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    try:
+        yield json.loads(process.stdout.readline())["address"]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=60) == 0
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_server_answers_as_the_local_build_does(recording: Recording, server: str) -> None:
+    assert roel("health", "--server", server, cwd=recording.folder).stdout == "SERVING\n"
+    done = recording.build("--server", server)
+    local = recording.build()
+    assert (done.returncode, done.stdout, done.stderr) == (3, "", local.stderr)
+    move_event_off_the_sensor(recording)
+    assert recording.build("--server", server).stderr == recording.build().stderr
+    assert not (recording.folder / "map.rlm").exists()
+
+
+def test_server_that_is_not_there_is_one_line(recording: Recording) -> None:
+    done = recording.build("--server", "127.0.0.1:9")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("roel: error: 127.0.0.1:9: expected ")
+    assert done.stderr.count("\n") == 1
 
 
 def test_printed_configuration_is_a_valid_configuration(tmp_path: Path) -> None:
