@@ -88,7 +88,7 @@ def test_line_above_the_plane_is_off_by_its_height():
 def test_counts_follow_the_formula():
     # Edge points along half the line, 1 mm beside every sample; as many are elsewhere.
     near = edge_points([0.001, 0, 0], [0.501, 0, 0], 101).points
-    edges = PointCloud(points=np.concatenate([near, near + [0, 1, 0]]))
+    edges = PointCloud(points=np.concatenate([near, near + np.array([0, 1, 0])]))
     result = evaluate_map(lines([[0, 0, 0], [1, 0, 0]]), SQUARE, edges)
     # Behind 0.501 m one, two and four more samples are within 5, 10 and 20 mm.
     assert result.iou_5 == 101 / (201 + 202 - 102)
