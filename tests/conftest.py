@@ -1,0 +1,16 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(scope="session")
+def data_folder() -> Path:
+    """Recordings that are not part of the repository; tests that need them skip without."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("ROEL_DATA", default))
+    if not folder.is_dir():
+        pytest.skip(f"no recordings in {folder}")
+    return folder
