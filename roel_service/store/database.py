@@ -29,6 +29,9 @@ class Database:
         self._engine = create_engine(f"sqlite:///{path}", isolation_level="AUTOCOMMIT")
         event.listen(self._engine, "connect", _configure)
         self._lock = threading.Lock()
+
+    def migrate(self) -> None:
+        """Bring the tables to the newest version; raises `StateError` DATA_TOO_NEW."""
         with self.write() as connection:
             migrate(connection)
 

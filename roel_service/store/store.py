@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import fcntl
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from roel_service.errors import StateError
 from roel_service.store.blobs import BlobStore
@@ -29,26 +30,24 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         make_folder(folder)
-        self._lock = _FolderLock(folder)
-        self._database = Database(folder / "rows.sqlite")
-        self._blobs = BlobStore(folder / "blobs" / "sha256")
-        self._recordings = Recordings(folder / "recordings")
-        self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
-        self.maps = Maps(self._database, self._blobs)
-        self.builds = Builds(self._database, self._blobs)
-        self._sweep()
+        with ExitStack() as resources:
+            resources.enter_context(_locked(folder))
+            self._database = Database(folder / "rows.sqlite")
+            resources.callback(self._database.close)
+            self._database.migrate()
+            self._blobs = BlobStore(folder / "blobs" / "sha256")
+            self._recordings = Recordings(folder / "recordings")
+            self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
+            self.maps = Maps(self._database, self._blobs)
+            self.builds = Builds(self._database, self._blobs)
+            self._sweep()
+            self._resources = resources.pop_all()
 
     def __enter__(self) -> Store:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._database.close()
-        self._lock.release()
+    def __exit__(self, *error: object) -> None:
+        self._resources.close()
 
     def _sweep(self) -> None:
         """Delete files that no row names: a crash left them, and nothing is being written yet."""
@@ -57,17 +56,13 @@ class Store:
         self._recordings.sweep(self.event_streams.open_uids())
 
 
-class _FolderLock:
-    """An advisory lock that ends with the process, however it ends."""
-
-    def __init__(self, folder: Path) -> None:
-        self._file = (folder / "lock").open("w")
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold an advisory lock, which the system releases however the process ends."""
+    with (folder / "lock").open("w") as file:
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            self._file.close()
             expected = "a data folder that no other server uses"
             raise StateError(str(folder), expected, "one in use", reason="DATA_IN_USE") from error
-
-    def release(self) -> None:
-        self._file.close()
+        yield
