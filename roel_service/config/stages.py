@@ -81,12 +81,14 @@ class FramesConfig(Stage, table="frames"):
 
     Attributes:
         rate_hz: frames a second.
+        min_frame_count: a shorter recording gets more frames a second, to have this many.
         compensate_rotation: undo the camera's rotation within a frame, by the poses.
         slot_us: events of one slot share one pose.
         min_half_window_us, max_half_window_us: bounds of every window around a frame's time.
     """
 
     rate_hz: float = parameter(30.0, POSITIVE)
+    min_frame_count: int = parameter(24, POSITIVE)
     compensate_rotation: bool = True
     slot_us: int = parameter(500, POSITIVE)
     min_half_window_us: int = parameter(6_000, POSITIVE)

@@ -5,6 +5,7 @@ Paper: "Multi-window, Multi-representation Line Detection"; frames are made at f
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -86,46 +87,54 @@ class EventImage:
     polarity: int
 
 
-def frame_times(trajectory: Trajectory, from_us: int, config: FramesConfig) -> Iterator[int]:
-    """Times at a fixed rate, in us, whose longest window lies within the poses."""
-    interval_us = round(1e6 / config.rate_hz)
+def frame_times(
+    trajectory: Trajectory, range_us: tuple[int, int] | None, config: FramesConfig
+) -> list[int]:
+    """Times, in us, at which lines are looked for.
+
+    They are `rate_hz` apart, or closer where a short recording would give less than
+    `min_frame_count` of them. The longest window around each lies within the poses.
+
+    Args:
+        trajectory: poses.
+        range_us: first and last event; None where unknown: the poses' range, at `rate_hz`.
+        config: rate, least number and longest window.
+    """
     reach_us = config.max_half_window_us
-    for first_us, last_us in trajectory.covered_us().tolist():
-        start_us = max(first_us, from_us) + reach_us
-        yield from range(start_us, last_us - reach_us + 1, interval_us)
+    limits_us = range_us or (int(trajectory.t_us[0]), int(trajectory.t_us[-1]))
+    inside = np.clip(trajectory.covered_us(), *limits_us) + np.array([reach_us, -reach_us])
+    inside = inside[inside[:, 0] <= inside[:, 1]]
+    interval_us = 1e6 / config.rate_hz
+    if range_us is not None:
+        duration_us = float(np.diff(inside).sum())
+        interval_us = min(interval_us, duration_us / config.min_frame_count)
+    step_us = max(1, round(interval_us))
+    return [t_us for first, last in inside.tolist() for t_us in range(first, last + 1, step_us)]
 
 
 def frame_slices(
-    chunks: Iterable[EventStream], trajectory: Trajectory, config: FramesConfig
+    chunks: Iterable[EventStream], times_us: list[int], reach_us: int
 ) -> Iterator[tuple[int, EventStream]]:
-    """Frame times with the events around each, read once and front to back.
+    """The events around each time, read once and front to back.
 
     Memory holds one chunk and one window, however long the recording is.
 
     Args:
         chunks: events in the order of time.
-        trajectory: poses; times they do not cover are passed over.
-        config: rate and longest window.
+        times_us: ascending; those later than the last event are passed over.
+        reach_us: events this close to a time belong to it.
 
     Yields:
-        (t_us, a stream that holds the events within `max_half_window_us` of it).
+        (t_us, a stream that holds the events within `reach_us` of it).
     """
-    reach_us = config.max_half_window_us
+    waiting = deque(times_us)
     buffer: EventStream | None = None
-    times: Iterator[int] = iter(())
-    t_us: int | None = None
     for chunk in chunks:
-        if len(chunk) == 0:
+        if len(chunk) == 0 or not waiting:
             continue
-        if buffer is None:
-            times = frame_times(trajectory, int(chunk.t_us[0]), config)
-            t_us = next(times, None)
-        if t_us is None:
-            continue
-        buffer = _extended(buffer, chunk, keep_from_us=t_us - reach_us)
-        while t_us is not None and t_us + reach_us <= buffer.t_us[-1]:
-            yield t_us, buffer
-            t_us = next(times, None)
+        buffer = _extended(buffer, chunk, keep_from_us=waiting[0] - reach_us)
+        while waiting and waiting[0] + reach_us <= buffer.t_us[-1]:
+            yield waiting.popleft(), buffer
 
 
 def _extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: int) -> EventStream:

@@ -164,14 +164,15 @@ def _lines_of_all_frames(
             plane_fit_s=time.perf_counter() - detected,
         )
 
-    expected_count = sum(1 for _ in frame_times(trajectory, 0, config.frames))
+    times_us = frame_times(trajectory, events.time_range_us, config.frames)
+    reach_us = config.frames.max_half_window_us
+    slices = enumerate(frame_slices(events.chunks(), times_us, reach_us))
     began = time.perf_counter()
-    slices = enumerate(frame_slices(events.chunks(), trajectory, config.frames))
     worker_count = config.runtime.worker_count or os.cpu_count() or 1
     done: list[_FrameLines] = []
     for lines in in_order(lines_of_frame, slices, worker_count):
         done.append(lines)
-        run.step(len(done), max(len(done), expected_count))
+        run.step(len(done), len(times_us))
     run.share_wall_clock(
         time.perf_counter() - began,
         {

@@ -45,6 +45,10 @@ class CountedEvents:
         self.total_count = 0
         self.covered_count = 0
 
+    @property
+    def time_range_us(self) -> tuple[int, int] | None:
+        return self._events.time_range_us
+
     def chunks(self) -> Iterator[EventStream]:
         for chunk in self._events.chunks():
             if len(chunk):

@@ -90,6 +90,11 @@ class EventStream:
     def __len__(self) -> int:
         return len(self.t_us)
 
+    @property
+    def time_range_us(self) -> tuple[int, int] | None:
+        """Times of the first and the last event; None for a stream without events."""
+        return (int(self.t_us[0]), int(self.t_us[-1])) if len(self) else None
+
     def chunks(self) -> Iterator[EventStream]:
         """A stream in memory is its own only chunk (see `EventSource`)."""
         yield self
@@ -127,6 +132,11 @@ class EventSource(Protocol):
 
     @property
     def height(self) -> int: ...
+
+    @property
+    def time_range_us(self) -> tuple[int, int] | None:
+        """Times of the first and the last event; None while they are not known."""
+        ...
 
     def chunks(self) -> Iterator[EventStream]:
         """Chunks in the order of time, each not before the end of the one before."""
