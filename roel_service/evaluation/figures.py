@@ -111,10 +111,18 @@ class View:
 
 def _times_us(trajectory: Trajectory, events: EventSource) -> IntArray:
     """Evenly spaced moments with both poses and events."""
-    first_us, last_us = trajectory.t_us[[0, -1]].tolist()
-    spans = np.array([chunk.t_us[[0, -1]] for chunk in events.chunks()])
-    start_us, stop_us = max(first_us, spans[0, 0]), min(last_us, spans[-1, 1])
+    first_us, last_us = events.time_range_us or _time_range_us(events)
+    start_us, stop_us = (
+        max(first_us, int(trajectory.t_us[0])),
+        min(last_us, int(trajectory.t_us[-1])),
+    )
     return np.linspace(start_us, stop_us, PATH_POINT_COUNT).astype(np.int64)
+
+
+def _time_range_us(events: EventSource) -> tuple[int, int]:
+    """First and last time of a recording that only reading it can tell."""
+    ends = np.array([chunk.t_us[[0, -1]] for chunk in events.chunks()])
+    return int(ends[0, 0]), int(ends[-1, 1])
 
 
 def best_view(line_map: LineMap, camera: Camera, times_us: IntArray, T_world_camera: SE3) -> View:
