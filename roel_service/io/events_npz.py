@@ -32,8 +32,16 @@ class NpzEvents:
     subject: str
     event_count: int
     t_offset_us: int = 0
-    # The last time of a compressed column is known once everything before it is read.
-    time_range_us: None = None
+
+    @property
+    def time_range_us(self) -> tuple[int, int]:
+        """First and last time; reads the column of times."""
+        with _columns(self.path, self.subject) as columns:
+            first_us = last_us = int(columns["t"].read(1)[0])
+            for start in range(1, self.event_count, CHUNK_EVENT_COUNT):
+                times = columns["t"].read(min(CHUNK_EVENT_COUNT, self.event_count - start))
+                last_us = int(times[-1])
+        return first_us, last_us
 
     @staticmethod
     def open(path: Path, subject: str) -> NpzEvents:

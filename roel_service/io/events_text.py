@@ -6,6 +6,7 @@ column, and microseconds when all of that column is written as integers.
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,12 @@ from roel_service.io.text import (
     us_from_seconds,
 )
 
+# Holds the last event line, unless kilobytes of comments follow it.
+_TAIL_BYTES = 4096
+# The time of a line of four numbers.
+_FIRST_COLUMN = re.compile(
+    rb"^[^\S\n]*([-+]?\d[\d.eE+-]*)(?=(?:[^\S\n]+[-+\d.eE]+){3}[^\S\n]*$)", re.MULTILINE
+)
 _SECONDS = re.compile(rb"^[^\S\n]*[-+]?\d*[.eE]", re.MULTILINE)
 # Integers up to here are exact in the float64 of the parser; all columns stay far below.
 _MAX_INTEGER = MAX_TIME_US
@@ -40,9 +47,21 @@ class TextEvents:
     path: Path
     subject: str
     t_offset_us: int = 0
-    # Both are known once the file is read.
+    # Known once the file is read.
     event_count: None = None
-    time_range_us: None = None
+
+    @property
+    def time_range_us(self) -> tuple[int, int] | None:
+        """First and last time, from both ends of the file; None where they are not well formed."""
+        with open_input(self.path) as file:
+            _, head = next(line_blocks(file, self.subject, EventsError), (1, b""))
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
+            tail = file.read()
+        times = _FIRST_COLUMN.findall(head)[:1] + _FIRST_COLUMN.findall(tail)[-1:]
+        if len(times) < 2:
+            return None
+        first_us, last_us = _times(np.array(times, dtype=np.float64), _is_seconds(head)).tolist()
+        return first_us, last_us
 
     def blocks(self) -> ColumnBlocks:
         """The events front to back, about 16 MB of text at a time.
@@ -57,7 +76,7 @@ class TextEvents:
                 if len(rows) == 0:
                     continue
                 if is_seconds is None:
-                    is_seconds = _SECONDS.search(block) is not None
+                    is_seconds = _is_seconds(block)
                 yield self._columns(rows, is_seconds, block, line)
 
     def _columns(self, rows: FloatArray, is_seconds: bool, block: bytes, line: int) -> EventColumns:
@@ -75,6 +94,10 @@ class TextEvents:
             )
         x, y, p = (column.astype(np.int64) for column in rows[:, 1:].T)
         return EventColumns(t_us=_times(rows[:, 0], is_seconds), x=x, y=y, p=p)
+
+
+def _is_seconds(first_block: bytes) -> bool:
+    return _SECONDS.search(first_block) is not None
 
 
 def _times(values: Array, is_seconds: bool) -> IntArray:

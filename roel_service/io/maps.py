@@ -86,8 +86,12 @@ def _records(line_map: LineMap) -> Iterator[tuple[list[list[float]], int, float,
 
 
 def _json(line_map: LineMap) -> Iterator[str]:
-    for record in _records(line_map):
-        yield json.dumps(dict(zip(_FIELDS, record, strict=True)))
+    """One array with a record a segment, each on a line of its own."""
+    yield "["
+    for index, record in enumerate(_records(line_map), 1):
+        comma = "," if index < len(line_map) else ""
+        yield json.dumps(dict(zip(_FIELDS, record, strict=True))) + comma
+    yield "]"
 
 
 def _csv(line_map: LineMap) -> Iterator[str]:

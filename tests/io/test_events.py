@@ -52,6 +52,15 @@ def test_every_format_gives_the_same_events(tmp_path, suffix):
 
 
 @formats
+def test_time_range_is_known_before_reading(tmp_path, suffix):
+    raw = columns(500)
+    WRITERS[suffix](tmp_path / f"e.{suffix}", raw)
+    expected = stream(raw)
+    source = open_events(tmp_path / f"e.{suffix}", WIDTH, HEIGHT)
+    assert source.time_range_us == (expected.t_us[0], expected.t_us[-1])
+
+
+@formats
 def test_negative_polarity_may_be_minus_one(tmp_path, suffix):
     raw = columns(50)
     signed = raw | {"p": np.where(raw["p"] == 1, 1, -1)}
@@ -216,11 +225,16 @@ class TestText:
         with contextlib.suppress(InputError):
             assert len(read(path)) > 0
 
-    def test_nothing_is_known_before_reading(self, tmp_path):
-        write_text(tmp_path / "e.txt", columns(5))
+    def test_comments_at_both_ends_do_not_hide_the_time_range(self, tmp_path):
+        lines = ["# t x y p", "", "0.5 1 1 0", "0.75 2 2 1", "# the end", ""]
+        (tmp_path / "e.txt").write_text("\n".join(lines))
         source = open_events(tmp_path / "e.txt", WIDTH, HEIGHT)
         assert source.event_count is None
-        assert source.time_range_us is None
+        assert source.time_range_us == (500_000, 750_000)
+
+    def test_time_range_of_malformed_lines_is_unknown(self, tmp_path):
+        (tmp_path / "e.txt").write_text("0.5 1 1\n0.6 1 1\n")
+        assert open_events(tmp_path / "e.txt", WIDTH, HEIGHT).time_range_us is None
 
 
 class TestHdf5:

@@ -45,8 +45,8 @@ def test_npz_holds_the_contract_and_is_read_back(tmp_path, line_map):
         np.testing.assert_array_equal(getattr(back, name), getattr(line_map, name))
 
 
-def test_json_holds_a_record_a_line(tmp_path, line_map):
-    records = [json.loads(line) for line in read_lines(line_map, tmp_path / "m.json")]
+def test_json_holds_a_record_a_segment(tmp_path, line_map):
+    records = json.loads("\n".join(read_lines(line_map, tmp_path / "m.json")))
     np.testing.assert_array_equal([r["segments"] for r in records], line_map.segments)
     assert [r["observation_count"] for r in records] == line_map.observation_count.tolist()
     assert [r["rms_residual"] for r in records] == line_map.rms_residual_px.tolist()
