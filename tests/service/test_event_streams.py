@@ -1,0 +1,260 @@
+import numpy as np
+import pytest
+
+from roel_service.errors import (
+    CameraError,
+    ConflictError,
+    EventsError,
+    InputError,
+    LimitError,
+    NotFoundError,
+    RoelError,
+    StateError,
+    TrajectoryError,
+)
+from roel_service.scene.camera import Camera
+from roel_service.v1 import events_pb2, types_pb2
+from roel_service.wire.chunks import encode_chunk
+from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
+
+from .processes import CAMERA, events_of, new_id, ready_recording, trajectory_of
+
+OPEN = events_pb2.EventStream.STATE_OPEN
+FINALIZED = events_pb2.EventStream.STATE_FINALIZED
+
+
+@pytest.fixture
+def stream(client):
+    return client.create_event_stream(new_id(), CAMERA)
+
+
+@pytest.fixture
+def call(client):
+    """A single call of the service by its name."""
+
+    def called(method, request):
+        return client._connection.call(getattr(client._streams, method), request)
+
+    return called
+
+
+@pytest.fixture
+def upload(client):
+    """A streaming call of the service by its name."""
+
+    def uploaded(method, *requests):
+        return client._connection.upload(getattr(client._streams, method), requests)
+
+    return uploaded
+
+
+def header(stream):
+    return events_pb2.AppendEventsRequest(event_stream=stream)
+
+
+def chunk(seq, data):
+    return events_pb2.AppendEventsRequest(chunk=events_pb2.EventChunk(seq=seq, data=data))
+
+
+def pose_header(stream):
+    return events_pb2.AppendPosesRequest(event_stream=stream)
+
+
+def poses(trajectory):
+    return events_pb2.AppendPosesRequest(poses=trajectory_to_proto(trajectory))
+
+
+def test_a_new_recording_is_open_and_remembers_its_camera(client, stream):
+    record = client.event_stream(stream)
+    assert record.name == stream
+    assert record.state == OPEN
+    assert record.camera == camera_to_proto(CAMERA)
+    assert record.create_time.seconds > 1_500_000_000
+
+
+def test_uploaded_events_and_poses_are_counted(client, stream):
+    events = events_of(200_000)
+    record = client.upload_events(stream, events)
+    assert (record.chunk_count, record.event_count) == (2, 200_000)
+    assert (record.start_us, record.end_us) == (events.t_us[0], events.t_us[-1])
+    assert client.upload_poses(stream, trajectory_of(9)).pose_count == 9
+
+
+def test_finalizing_twice_gives_the_same_recording(client, stream):
+    client.upload_events(stream, events_of(10))
+    record = client.finalize(stream)
+    assert record.state == FINALIZED
+    assert len(record.digest) == 64
+    assert client.finalize(stream) == record
+
+
+def test_equal_events_give_equal_digests(client):
+    first, second = (client.event_stream(ready_recording(client)) for _ in range(2))
+    assert first.digest == second.digest
+
+
+def test_a_deleted_recording_is_not_found(client, stream):
+    client.delete_event_stream(stream)
+    with pytest.raises(NotFoundError):
+        client.event_stream(stream)
+    with pytest.raises(NotFoundError):
+        client.delete_event_stream(stream)
+
+
+def test_pages_hold_every_recording_once(client, call):
+    made = {client.create_event_stream(new_id(), CAMERA) for _ in range(5)}
+    found, token = [], ""
+    while True:
+        request = events_pb2.ListEventStreamsRequest(
+            parent="projects/default", page_size=2, page_token=token
+        )
+        page = call("ListEventStreams", request)
+        assert len(page.event_streams) <= 2
+        found += [item.name for item in page.event_streams]
+        token = page.next_page_token
+        if not token:
+            break
+    assert made <= set(found)
+    assert found == sorted(set(found))
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"page_size": -1}, "PAGE_SIZE_INVALID"),
+        ({"page_token": "x"}, "PAGE_TOKEN_INVALID"),
+        ({"page_token": "WyJtYXBzIiwgImEiXQ=="}, "PAGE_TOKEN_INVALID"),
+        ({"page_token": "é"}, "PAGE_TOKEN_INVALID"),
+        ({"parent": "projects/other"}, "NOT_FOUND"),
+    ],
+)
+def test_list_arguments_that_cannot_be_are_refused(call, fields, reason):
+    request = events_pb2.ListEventStreamsRequest(**{"parent": "projects/default", **fields})
+    with pytest.raises(RoelError) as caught:
+        call("ListEventStreams", request)
+    assert caught.value.reason == reason
+
+
+def test_ids_and_cameras_are_checked(client, call):
+    stream_id = new_id()
+    client.create_event_stream(stream_id, CAMERA)
+    with pytest.raises(ConflictError) as taken:
+        client.create_event_stream(stream_id, CAMERA)
+    assert taken.value.reason == "ALREADY_EXISTS"
+    with pytest.raises(InputError) as named:
+        client.create_event_stream("No", CAMERA)
+    assert named.value.reason == "ID_INVALID"
+    request = events_pb2.CreateEventStreamRequest(
+        parent="projects/default",
+        event_stream_id=new_id(),
+        event_stream=events_pb2.EventStream(camera=types_pb2.Camera(width=3)),
+    )
+    with pytest.raises(CameraError):
+        call("CreateEventStream", request)
+
+
+def test_events_of_another_sensor_are_refused(client, stream):
+    other = Camera(width=65, height=48, fx_px=1.0, fy_px=1.0, cx_px=0.0, cy_px=0.0)
+    with pytest.raises(EventsError, match="64x48 sensor, as the camera's, found 65x48") as caught:
+        client.upload_events(stream, events_of(10, camera=other))
+    assert caught.value.reason == "SENSOR_MISMATCH"
+
+
+def changed(data, place):
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda data: data[:-1], "CHUNK_MALFORMED"),
+        (lambda data: changed(data, -1 + len(data)), "CHUNK_CRC_MISMATCH"),
+        (lambda data: changed(data, 20), "CHUNK_CRC_MISMATCH"),
+        (lambda data: b"", "CHUNK_MALFORMED"),
+        (lambda data: b"not a chunk" * 10, "CHUNK_MALFORMED"),
+    ],
+)
+def test_damaged_chunks_are_refused_and_leave_nothing(client, upload, stream, damage, reason):
+    data = damage(encode_chunk(events_of(100)))
+    with pytest.raises(EventsError) as caught:
+        upload("AppendEvents", header(stream), chunk(0, data))
+    assert caught.value.reason == reason
+    assert client.event_stream(stream).chunk_count == 0
+
+
+def test_a_chunk_that_goes_back_in_time_is_refused(upload, stream):
+    data = encode_chunk(events_of(100))
+    with pytest.raises(EventsError) as caught:
+        upload("AppendEvents", header(stream), chunk(0, data), chunk(1, data))
+    assert caught.value.reason == "EVENT_TIME_NOT_MONOTONE"
+
+
+def test_gaps_and_conflicts_are_told_apart(client, upload, stream):
+    data = encode_chunk(events_of(100))
+    with pytest.raises(StateError) as gap:
+        upload("AppendEvents", header(stream), chunk(3, data))
+    assert gap.value.reason == "SEQUENCE_GAP"
+    upload("AppendEvents", header(stream), chunk(0, data))
+    assert upload("AppendEvents", header(stream), chunk(0, data)).chunk_count == 1
+    with pytest.raises(ConflictError) as conflict:
+        upload("AppendEvents", header(stream), chunk(0, encode_chunk(events_of(100, seed=1))))
+    assert conflict.value.reason == "CHUNK_CONFLICT"
+
+
+def test_an_upload_begins_with_the_name_of_its_recording(upload, stream):
+    data = encode_chunk(events_of(100))
+    for requests in ([], [chunk(0, data)], [header(stream), header(stream)]):
+        with pytest.raises(InputError):
+            upload("AppendEvents", *requests)
+    with pytest.raises(InputError):
+        upload("AppendPoses", poses(trajectory_of(3)))
+    with pytest.raises(NotFoundError):
+        upload("AppendEvents", header("projects/default/eventStreams/nowhere"), chunk(0, data))
+
+
+def test_a_recording_has_a_largest_size(client, stream):
+    with pytest.raises(LimitError) as caught:
+        client.upload_events(stream, events_of(400_000))
+    assert caught.value.reason == "EVENT_STREAM_TOO_LARGE"
+
+
+def test_a_message_has_a_largest_size(upload, stream):
+    with pytest.raises(LimitError):
+        upload("AppendEvents", header(stream), chunk(0, b"x" * (5 << 20)))
+
+
+def test_poses_are_checked(client, upload, stream):
+    trajectory = trajectory_of(5)
+    bad = trajectory_to_proto(trajectory)
+    bad.rotation = np.zeros((5, 3, 3)).tobytes()
+    with pytest.raises(TrajectoryError):
+        upload("AppendPoses", pose_header(stream), events_pb2.AppendPosesRequest(poses=bad))
+    client.upload_poses(stream, trajectory)
+    with pytest.raises(TrajectoryError, match="poses after 20000 us"):
+        client.upload_poses(stream, trajectory)
+    assert client.event_stream(stream).pose_count == 5
+
+
+@pytest.mark.parametrize("count", [101, 100_000])
+def test_there_are_only_so_many_poses(client, stream, count):
+    with pytest.raises(LimitError) as caught:
+        client.upload_poses(stream, trajectory_of(count))
+    assert caught.value.reason == "TOO_MANY_POSES"
+
+
+def test_a_finalized_recording_takes_nothing_more(client):
+    stream = ready_recording(client)
+    with pytest.raises(StateError) as events:
+        client._connection.upload(
+            client._streams.AppendEvents,
+            [header(stream), chunk(1, encode_chunk(events_of(3, duration_us=10)))],
+        )
+    with pytest.raises(StateError) as late_poses:
+        client.upload_poses(stream, trajectory_of(3))
+    assert events.value.reason == late_poses.value.reason == "STREAM_FINALIZED"
+
+
+def test_a_recording_needs_events(client, stream):
+    with pytest.raises(EventsError) as caught:
+        client.finalize(stream)
+    assert caught.value.reason == "NO_EVENTS"

@@ -1,0 +1,206 @@
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
+    ProtoReflectionDescriptorDatabase,
+)
+
+from roel_client import Client
+from roel_client.client import Operation
+from roel_service import __version__
+from roel_service.errors import RoelError, UnavailableError
+from roel_service.scene.results import MAPPING_STAGES
+from roel_service.service.server import SERVICES
+
+from .processes import CAMERA, Server, config_of, events_of, new_id, ready_recording, wait_until
+from .sample_builds import QUICK, SLOW
+
+HEAVY = ("torch", "open3d", "cv2", "numba", "llvmlite")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "data"
+
+
+def command(folder, *options):
+    return [sys.executable, "-m", "roel_service.service", "--data", folder, *options]
+
+
+def refused(*arguments):
+    """What a server says that ends at once with code 2."""
+    ended = subprocess.run(arguments, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    return ended.stderr
+
+
+def test_capabilities_name_version_limits_presets_and_stages(client):
+    answer = client.capabilities()
+    assert answer.version == __version__
+    assert tuple(answer.stages) == MAPPING_STAGES
+    assert list(answer.presets) == ["default", "paper"]
+    assert answer.limits.pose_count == 100
+    assert answer.limits.events_per_chunk == 131_072
+    assert all(value > 0 for _, value in answer.limits.ListFields())
+
+
+@pytest.mark.parametrize("service", ["", *SERVICES])
+def test_every_service_is_healthy(server, service):
+    with grpc.insecure_channel(server.address) as channel:
+        request = health_pb2.HealthCheckRequest(service=service)
+        answer = health_pb2_grpc.HealthStub(channel).Check(request, timeout=10)
+    assert answer.status == health_pb2.HealthCheckResponse.SERVING
+
+
+def test_reflection_describes_every_service(server):
+    with grpc.insecure_channel(server.address) as channel:
+        database = ProtoReflectionDescriptorDatabase(channel)
+        assert set(SERVICES) <= set(database.get_services())
+        described = database.FindFileContainingSymbol("roel_service.v1.MapService")
+    assert "BuildMap" in [method.name for method in described.service[0].method]
+
+
+def test_a_running_front_holds_no_algorithm(server, client):
+    client.build_map(client.create_map(new_id()), ready_recording(client), config_of(QUICK)).wait()
+    mapped = Path(f"/proc/{server.process.pid}/maps").read_text()
+    assert "_cython" in mapped, "the list of mapped libraries is not what this test expects"
+    for name in HEAVY:
+        assert f"/{name}" not in mapped
+
+
+def test_importing_the_front_loads_no_algorithm():
+    script = "import sys, roel_service.service.server; print([m for m in %r if m in sys.modules])"
+    run = [sys.executable, "-c", script % (HEAVY,)]
+    assert subprocess.run(run, capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+def test_a_fault_is_told_by_its_id_alone(server, client):
+    stream = client.create_event_stream(new_id(), CAMERA)
+    for path in (server.folder / "recordings").iterdir():
+        path.unlink()
+    with pytest.raises(RoelError) as caught:
+        client.upload_events(stream, events_of(10))
+    assert type(caught.value) is RoelError
+    fault_id = re.search(r"logged as ([0-9a-f]{12})$", str(caught.value))[1]
+    assert str(server.folder) not in str(caught.value)
+    assert f"fault {fault_id} in /roel_service.v1.EventStreamService/AppendEvents" in server.log
+    assert "FileNotFoundError" in server.log
+
+
+def test_the_module_announces_its_address_and_ends_with_0(folder):
+    with subprocess.Popen(command(folder, "--port", "0"), stdout=subprocess.PIPE) as process:
+        address = json.loads(process.stdout.readline())["address"]
+        with Client(address) as client:
+            assert client.capabilities().version == __version__
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+
+
+def test_a_folder_serves_one_server(server):
+    assert "one in use" in refused(*command(server.folder, "--port", "0"))
+
+
+def test_a_taken_port_is_told(server, folder):
+    said = refused(*command(folder, "--port", str(server.port)))
+    assert f"{server.address}: expected a free address" in said
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "example.org"])
+def test_only_loopback_is_served_without_encryption(folder, host):
+    assert "--host: expected a loopback address" in refused(*command(folder, "--host", host))
+    assert not folder.exists()
+
+
+def test_another_host_is_served_when_that_is_wanted(folder):
+    options = ["--host", "0.0.0.0", "--insecure", "--port", "0"]
+    with subprocess.Popen(command(folder, *options), stdout=subprocess.PIPE) as process:
+        assert json.loads(process.stdout.readline())["address"].startswith("0.0.0.0:")
+        process.terminate()
+        assert process.wait(30) == 0
+
+
+def test_committed_chunks_survive_a_killed_server(folder):
+    first = Server(folder, commit_bytes=1)
+    sent = threading.Event()
+    killed = threading.Event()
+
+    class Source:
+        """Stops half way until the server is gone."""
+
+        width, height = CAMERA.width, CAMERA.height
+
+        def chunks(self):
+            yield events_of(300_000)
+            sent.set()
+            killed.wait()
+
+    def upload(client, stream):
+        with pytest.raises(UnavailableError):
+            client._append_events(stream, Source(), lambda progress: None)
+
+    with Client(first.address) as client:
+        stream = client.create_event_stream("walk", CAMERA)
+        uploading = threading.Thread(target=upload, args=(client, stream))
+        uploading.start()
+        sent.wait()
+        wait_until(lambda: client.event_stream(stream).chunk_count == 2)
+        first.kill()
+        killed.set()
+        uploading.join()
+    second = Server(folder)
+    with Client(second.address) as client:
+        record = client.event_stream(stream)
+        assert (record.chunk_count, record.event_count) == (2, 262_144)
+        assert client.upload_events(stream, events_of(300_000)).event_count == 300_000
+        client.finalize(stream)
+    assert second.stop() == 0
+
+
+def test_a_build_fails_as_lost_when_its_server_was_killed(folder):
+    first = Server(folder)
+    with Client(first.address) as client:
+        map_name = client.create_map("house")
+        name = client.build_map(map_name, ready_recording(client), config_of(SLOW)).name
+        child = first.child_pid()
+        first.kill()
+    second = Server(folder)
+    with (
+        Client(second.address) as client,
+        pytest.raises(UnavailableError, match="a server that ended during the build"),
+    ):
+        Operation(client._connection, name).wait()
+    wait_until(lambda: not Path(f"/proc/{child}").exists())
+    assert second.stop() == 0
+
+
+def test_a_draining_server_ends_its_builds_and_answers_whoever_waits(folder):
+    server = Server(folder)
+    with Client(server.address) as client:
+        map_name = client.create_map("house")
+        operation = client.build_map(map_name, ready_recording(client), config_of(SLOW))
+        child = server.child_pid()
+        outcome = []
+
+        def wait():
+            try:
+                operation.wait()
+            except RoelError as error:
+                outcome.append(error.reason)
+
+        waiting = threading.Thread(target=wait)
+        waiting.start()
+        os.kill(server.process.pid, signal.SIGTERM)
+        assert server.stop() == 0
+        waiting.join()
+    assert outcome[0] in ("DRAINING", "UNAVAILABLE")
+    assert not Path(f"/proc/{child}").exists()
+    assert "Traceback" not in server.log
