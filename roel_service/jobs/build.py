@@ -142,6 +142,10 @@ class _DigestedSource:
     def height(self) -> int:
         return self._source.height
 
+    @property
+    def time_range_us(self) -> tuple[int, int] | None:
+        return self._source.time_range_us
+
     def chunks(self) -> Iterator[EventStream]:
         """The chunks of the source."""
         for chunk in self._source.chunks():

@@ -21,11 +21,13 @@ class BuildParameters:
 
     Attributes:
         event_file: chunks of a finalized recording, one behind the other.
+        time_range_us: first and last event.
         chunk_lengths: bytes of each chunk.
         pose_files: serialized `Trajectory` messages in the order of time.
     """
 
     event_file: Path
+    time_range_us: tuple[int, int]
     chunk_lengths: Sequence[int]
     pose_files: Sequence[Path]
     camera: Camera
@@ -34,31 +36,32 @@ class BuildParameters:
     def open(self) -> tuple[EventSource, Trajectory, Camera]:
         """The recording; its events are read when somebody asks for them."""
         parts = (types_pb2.Trajectory.FromString(path.read_bytes()) for path in self.pose_files)
-        events = SealedRecording(self.event_file, self.chunk_lengths, self.camera)
-        return events, trajectory_from_proto(*parts), self.camera
+        return SealedRecording(self), trajectory_from_proto(*parts), self.camera
 
 
 class SealedRecording:
     """A finalized recording as a source of events; one chunk is in memory at a time."""
 
-    def __init__(self, path: Path, chunk_lengths: Sequence[int], camera: Camera) -> None:
-        self._path = path
-        self._chunk_lengths = chunk_lengths
-        self._camera = camera
+    def __init__(self, parameters: BuildParameters) -> None:
+        self._parameters = parameters
 
     @property
     def width(self) -> int:
-        return self._camera.width
+        return self._parameters.camera.width
 
     @property
     def height(self) -> int:
-        return self._camera.height
+        return self._parameters.camera.height
+
+    @property
+    def time_range_us(self) -> tuple[int, int]:
+        return self._parameters.time_range_us
 
     def chunks(self) -> Iterator[EventStream]:
         """Decoded chunks in the order of time."""
         previous_t1_us = None
-        with self._path.open("rb") as file:
-            for length in self._chunk_lengths:
+        with self._parameters.event_file.open("rb") as file:
+            for length in self._parameters.chunk_lengths:
                 chunk = decode_chunk(file.read(length), previous_t1_us=previous_t1_us)
                 previous_t1_us = int(chunk.t_us[-1])
                 yield chunk

@@ -110,6 +110,7 @@ class MapServicer:
         stream = streams.get(stream_id)
         parameters = BuildParameters(
             event_file=streams.event_file(stream),
+            time_range_us=(stream.start_us, stream.end_us),
             chunk_lengths=streams.chunk_lengths(stream),
             pose_files=streams.pose_files(stream),
             camera=stream.camera,
