@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,26 +156,6 @@ def test_recording_without_lines_has_no_answer(recording: Recording) -> None:
     assert done.stderr.startswith("roel: no answer: ")
     assert done.stderr.count("\n") == 1
     assert not (recording.folder / "map.rlm").exists()
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
-    """Address of a server that runs as a process; it has to end with 0."""
-    process = subprocess.Popen(
-        [ROEL, "serve", "--data", "data", "--port", "0"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    try:
-        yield json.loads(process.stdout.readline())["address"]
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=60) == 0
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
 
 
 def test_server_answers_as_the_local_build_does(recording: Recording, server: str) -> None:
