@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# No limit on time: a busy machine is no failure. Few examples, drawn anew in every run.
+settings.register_profile("project", deadline=None, max_examples=30)
+settings.load_profile("project")
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.geometry.se3 import SE3, rotation_from_vector
-from roel_service.geometry.vectors import any_normal, dot, norm, unit
+from roel_service.geometry.vectors import MIN_LENGTH, any_normal, dot, norm, unit
 
 # Sine of the angle below which two directions count as parallel: the position of an intersection
 # has then lost twelve of float64's sixteen digits.
@@ -83,7 +83,7 @@ def orthonormal_from_plucker(
     foot = nearest_to_origin(direction, moment)
     length_m = norm(foot)
     # A moment is normal to its direction; one that is not is the rounding error of zero.
-    through_origin = length_m <= 0.5 * norm(moment)
+    through_origin = length_m <= np.maximum(0.5 * norm(moment), MIN_LENGTH)
     third = np.where(through_origin[..., None], any_normal(direction), unit(foot))
     U = np.stack([direction, np.cross(third, direction), third], axis=-1)
     return U, np.where(through_origin, 0.0, np.arctan(length_m))

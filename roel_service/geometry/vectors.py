@@ -6,6 +6,9 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 
+# Squares of shorter vectors underflow, and with them the digits of the length.
+MIN_LENGTH = 1e-150
+
 
 def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """(*B,) inner products of (*B, D) vectors."""
@@ -18,9 +21,9 @@ def norm(vectors: FloatArray) -> FloatArray:
 
 
 def unit(vectors: FloatArray) -> FloatArray:
-    """(*B, D) vectors of length one; NaN for a zero vector."""
+    """(*B, D) vectors of length one; NaN for a vector shorter than `MIN_LENGTH`."""
     length = norm(vectors)[..., None]
-    return np.asarray(vectors / np.where(length > 0, length, np.nan), dtype=np.float64)
+    return np.asarray(vectors / np.where(length > MIN_LENGTH, length, np.nan), dtype=np.float64)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:

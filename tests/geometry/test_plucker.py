@@ -22,6 +22,7 @@ from roel_service.geometry.plucker import (
     shift_origin,
     transform_lines,
 )
+from roel_service.geometry.vectors import unit
 
 from .strategies import (
     BATCH_SHAPES,
@@ -102,11 +103,18 @@ def test_line_through_origin_keeps_unit_direction(direction):
     np.testing.assert_array_equal(back_moment, 0.0)
 
 
-@pytest.mark.parametrize("length_m", [1e-150, 1e-15, 1e-7, 1.0, 1e3])
+@pytest.mark.parametrize("length_m", [1e-149, 1e-15, 1e-7, 1.0, 1e3])
 def test_orthonormal_form_holds_for_any_length_of_the_moment(length_m):
     U, phi = orthonormal_from_plucker(X, length_m * Y)
     np.testing.assert_allclose(U, np.eye(3), rtol=0, atol=1e-15)
     np.testing.assert_allclose(np.tan(phi), length_m, rtol=1e-12)
+
+
+@pytest.mark.parametrize("length_m", [1e-150, 1e-160, 1e-300, 5e-324])
+def test_moment_whose_square_underflows_counts_as_zero(length_m):
+    U, phi = orthonormal_from_plucker(unit(X + Z), length_m * Y)
+    assert phi == 0.0
+    np.testing.assert_allclose(U.T @ U, np.eye(3), atol=1e-15)
 
 
 @pytest.mark.parametrize("noise", [X, -X, X + 0.3 * Y])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from roel_service.geometry.vectors import angle_between, any_normal, unit
+from roel_service.geometry.vectors import MIN_LENGTH, angle_between, any_normal, unit
 
 from .strategies import points, unit_vectors
 
@@ -11,6 +11,15 @@ def test_zero_vector_has_no_direction():
     directions = unit(np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 4.0]]))
     assert np.isnan(directions[0]).all()
     np.testing.assert_allclose(directions[1], [0, 0.6, 0.8], rtol=1e-15)
+
+
+@pytest.mark.parametrize("length", [1e-200, 1e-160, 1e-149, 1e-8, 1e150])
+def test_direction_has_length_one_or_is_refused(length):
+    direction = unit(length * np.array([0.0, 1.0, -1.0]))
+    if length < MIN_LENGTH:
+        assert np.isnan(direction).all()
+    else:
+        np.testing.assert_allclose(direction, np.sqrt(0.5) * np.array([0, 1, -1]), rtol=1e-15)
 
 
 @given(unit_vectors((4,)))
