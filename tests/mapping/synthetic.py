@@ -1,0 +1,273 @@
+"""A small world with exact answers: a camera on a smooth path, and straight edges before it.
+
+Everything is given for a world of size 1 m; `world(scale)` stretches lines and path alike, which
+leaves all images as they are.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.config.stages import FramesConfig, RefineConfig
+from roel_service.geometry import plucker, projection, segments
+from roel_service.geometry.se3 import SE3, rotation_from_vector
+from roel_service.mapping.evidence import measure_evidence
+from roel_service.mapping.frames import EventFrame, Frames, frames_at
+from roel_service.mapping.views import views_of
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventSlice, EventStream
+from roel_service.scene.lines import InfiniteLines, LineObservations, LineTracks
+from roel_service.scene.trajectory import Trajectory
+
+CAMERA = Camera(width=160, height=120, fx_px=120.0, fy_px=120.0, cx_px=79.5, cy_px=59.5)
+DURATION_US = 2_000_000
+
+# Twelve edges about the world's origin, 2 m before the camera; the first passes the origin.
+SEGMENTS_WORLD = np.array(
+    [
+        [[-0.30, -0.12, 0.20], [0.30, 0.12, -0.20]],
+        [[-0.80, -0.60, 0.30], [-0.10, -0.65, 0.50]],
+        [[0.15, -0.62, 0.10], [0.85, -0.50, 0.60]],
+        [[-0.90, -0.40, 0.00], [-0.85, 0.50, 0.20]],
+        [[0.80, -0.35, -0.10], [0.78, 0.45, 0.10]],
+        [[-0.75, 0.60, 0.20], [-0.05, 0.66, -0.10]],
+        [[0.10, 0.62, 0.40], [0.75, 0.60, 0.10]],
+        [[-0.60, -0.35, 0.30], [-0.55, 0.40, -0.20]],
+        [[0.50, -0.40, -0.20], [0.48, 0.35, 0.30]],
+        [[-0.40, -0.45, -0.10], [0.35, -0.38, 0.30]],
+        [[-0.40, 0.48, 0.50], [0.35, 0.38, 0.10]],
+        [[-0.30, 0.15, 0.60], [0.25, 0.30, 0.70]],
+    ]
+)
+
+# Poses so dense that the motion between them is straight for all that is measured here.
+POSE_STEP_US = 5_000
+# An exact event lies at the middle of its slot when slots are this long.
+EXACT_SLOT_US = 1
+EXACT_FRAMES = FramesConfig(slot_us=EXACT_SLOT_US)
+
+
+def path(t_us, scale=1.0):
+    """Poses on a loop some 0.5 m wide, looking at the origin with a slow turn of the head."""
+    phase = 2 * np.pi * np.asarray(t_us) / DURATION_US
+    centre = np.stack(
+        [0.30 * np.sin(phase), 0.22 * np.cos(phase), -2.0 + 0.10 * np.sin(2 * phase)], axis=-1
+    )
+    turn = np.stack(
+        [0.05 * np.sin(phase + 1.0), 0.06 * np.cos(phase), 0.10 * np.sin(phase)], axis=-1
+    )
+    return SE3(rotation=rotation_from_vector(turn), translation=scale * centre)
+
+
+def trajectory(scale=1.0, first_us=0, last_us=DURATION_US):
+    t_us = np.arange(first_us, last_us + 1, POSE_STEP_US)
+    return Trajectory(t_us=t_us, T_world_camera=path(t_us, scale))
+
+
+@dataclass(frozen=True, kw_only=True)
+class World:
+    """Truth and what is seen of it; `line_of` tells the segment behind each observation."""
+
+    segments: np.ndarray
+    trajectory: Trajectory
+    frames: Frames
+    observations: LineObservations
+    line_of: np.ndarray
+
+    @property
+    def lines(self):
+        direction, moment = plucker.plucker_from_endpoints(self.segments)
+        return InfiniteLines(direction=direction, moment=moment)
+
+    @property
+    def tracks(self):
+        return LineTracks.from_rows(self.line_of, np.arange(len(self.line_of)), len(self.segments))
+
+    @property
+    def views(self):
+        return views_of(self.observations, self.frames)
+
+    def evidence(self, refine=None):
+        refine = refine or RefineConfig()
+        return measure_evidence(
+            self.observations, self.frames, self.trajectory, EXACT_FRAMES, refine
+        )
+
+
+def world(
+    scale=1.0, segments_world=SEGMENTS_WORLD, frame_count=24, noise_px=0.0, event_noise_px=0.0
+):
+    """The edges, seen in every frame in which they are wholly in the image.
+
+    Args:
+        noise_px: standard deviation of the observed ends, across the segment.
+        event_noise_px: of the supporting events.
+    """
+    truth = scale * np.asarray(segments_world)
+    poses = trajectory(scale)
+    t_us = np.linspace(20_000, DURATION_US - 20_000, frame_count).astype(np.int64)
+    frames = frames_at(t_us, poses, CAMERA)
+    rng = np.random.default_rng(0)
+    found = observe(truth, poses, frames, rng, noise_px, event_noise_px)
+    observations, line_of = found
+    return World(
+        segments=truth, trajectory=poses, frames=frames, observations=observations, line_of=line_of
+    )
+
+
+def observe(truth, poses, frames, rng, noise_px=0.0, event_noise_px=0.0, event_count=40):
+    """Exact 2D lines with speeds and supporting events, and the segment behind each of them."""
+    frame_of, line_of, projected, speeds, xy_px, dt_us = [], [], [], [], [], []
+    for frame, t_us in enumerate(frames.t_us):
+        T_camera_world = frames.T_world_camera[frame].inverse()
+        ends_px = projection.project(T_camera_world @ truth, frames.K)
+        for line in np.flatnonzero(in_image(ends_px)):
+            frame_of.append(frame)
+            line_of.append(line)
+            projected.append(ends_px[line])
+            speeds.append(normal_speed(truth[line], frame, poses, frames))
+            dt = np.sort(rng.integers(-2_000, 2_001, event_count))
+            dt = dt[np.argsort(np.abs(dt), kind="stable")]
+            xy_px.append(points_at(truth[line], rng.random(event_count), t_us + dt, poses))
+            dt_us.append(dt)
+    projected = np.array(projected)
+    shift_px = noise_px * rng.standard_normal((len(projected), 2))
+    events_px = np.concatenate(xy_px)
+    events_px = events_px + event_noise_px * rng.standard_normal(events_px.shape)
+    normal = segments.left_normal(projected)
+    observations = LineObservations(
+        frame=np.array(frame_of, np.int32),
+        segments_px=projected + shift_px[..., None] * normal[:, None],
+        polarity=np.where(np.array(line_of) % 2, 1, -1),
+        normal_speed_px_per_ms=np.array(speeds),
+        event_offsets=event_count * np.arange(len(projected) + 1),
+        event_xy_px=events_px.astype(np.float32),
+        event_dt_us=np.concatenate(dt_us).astype(np.int32),
+    )
+    return observations, np.array(line_of)
+
+
+def in_image(ends_px):
+    size_px = np.array([CAMERA.width - 1, CAMERA.height - 1])
+    return ((ends_px >= 0) & (ends_px <= size_px)).all(axis=(-2, -1))
+
+
+def points_at(segment, share, t_us, poses):
+    """(n, 2) px of the points at these shares of a segment, seen at their own times."""
+    points = segment[0] + np.asarray(share)[:, None] * (segment[1] - segment[0])
+    return projection.project(poses.interpolate(t_us).inverse() @ points, CAMERA.matrix)
+
+
+def normal_speed(segment, frame, poses, frames):
+    """Speed in px/ms of the middle of the image of a segment, the camera's turn undone.
+
+    A point at normalised (x, y) and depth z moves by f (x w_z - w_x, y w_z - w_y) / z a second
+    when the camera moves by w (m/s, in its own axes).
+    """
+    pose = frames.T_world_camera[frame]
+    t_us = frames.t_us[frame]
+    step = poses.interpolate(t_us + np.array([-1_000, 1_000])).translation
+    w = pose.inverse().rotate((step[1] - step[0]) / 2e-3)
+    ends = pose.inverse() @ segment
+    ends_px = projection.project(ends, frames.K)
+    middle = projection.normalized_from_pixel(ends_px.mean(axis=0), frames.K)
+    # The point of the segment that is seen at the middle of its image.
+    share = ends[0, 2] / ends[:, 2].sum()
+    depth_m = ends[0, 2] + share * (ends[1, 2] - ends[0, 2])
+    motion = frames.focal_px * (middle * w[2] - w[:2]) / depth_m
+    return segments.left_normal(ends_px) @ motion * 1e-3
+
+
+def moving_line_events(
+    segment_px,
+    speed_px_per_ms,
+    turn_per_ms=0.0,
+    count=400,
+    half_window_ms=10.0,
+    polarity=1,
+    noise_px=0.0,
+    seed=0,
+):
+    """(count, 2) positions, (count,) times in us and polarities on one space-time plane."""
+    rng = np.random.default_rng(seed)
+    segment_px = np.asarray(segment_px, dtype=np.float64)
+    t_us = np.sort(rng.integers(int(-1e3 * half_window_ms), int(1e3 * half_window_ms) + 1, count))
+    on_line = segment_px[0] + rng.random(count)[:, None] * (segment_px[1] - segment_px[0])
+    across = speed_px_per_ms * t_us * 1e-3 + noise_px * rng.standard_normal(count)
+    xy_px = on_line + across[:, None] * segments.left_normal(segment_px)
+    return xy_px, t_us, np.full(count, polarity, np.int8)
+
+
+def event_frame_of(*parts, width=CAMERA.width, height=CAMERA.height, t_ref_us=0):
+    """An `EventFrame` with sub-pixel positions, of one window."""
+    xy_px = np.concatenate([np.asarray(part[0]).reshape(-1, 2) for part in parts])
+    t_us = np.concatenate([part[1] for part in parts]).astype(np.int64)
+    polarity = np.concatenate([part[2] for part in parts]).astype(np.int8)
+    order = np.argsort(t_us, kind="stable")
+    xy_px = xy_px[order].astype(np.float32)
+    pixel = np.clip(np.rint(xy_px), 0, [width - 1, height - 1]).astype(np.uint16)
+    return EventFrame(
+        events=EventSlice(
+            t_us=t_us[order] + t_ref_us,
+            x=pixel[:, 0],
+            y=pixel[:, 1],
+            polarity=polarity[order],
+            t_ref_us=t_ref_us,
+        ),
+        ideal_px=xy_px,
+        compensated_px=xy_px,
+        windows=((0, len(xy_px)),),
+        width=width,
+        height=height,
+    )
+
+
+def event_stream(segments_world=SEGMENTS_WORLD, scale=1.0, last_us=DURATION_US, seed=0):
+    """Rounded events at random times along the moving edges, about two a px and 10 ms."""
+    rng = np.random.default_rng(seed)
+    poses = trajectory(scale)
+    columns = []
+    for line, segment in enumerate(scale * np.asarray(segments_world)):
+        length_px = np.linalg.norm(
+            np.diff(points_at(segment, [0.0, 1.0], np.array([0, 0]), poses), axis=0)
+        )
+        count = int(length_px * 2 * last_us / 10_000)
+        t_us = rng.integers(0, last_us + 1, count)
+        xy = np.rint(points_at(segment, rng.random(count), t_us, poses))
+        inside = ((xy >= 0) & (xy < [CAMERA.width, CAMERA.height])).all(axis=1)
+        polarity = np.full(count, 1 if line % 2 else -1)
+        columns.append(np.column_stack([t_us, xy, polarity])[inside])
+    t_us, x, y, polarity = np.concatenate(columns).T
+    order = np.argsort(t_us, kind="stable")
+    return EventStream(
+        t_us=t_us[order].astype(np.int64),
+        x=x[order].astype(np.uint16),
+        y=y[order].astype(np.uint16),
+        polarity=polarity[order].astype(np.int8),
+        width=CAMERA.width,
+        height=CAMERA.height,
+    )
+
+
+def line_errors(lines, truth):
+    """(L, 2) larger distance of the ends of true segments from the (L,) lines, and angle in rad."""
+    feet = plucker.nearest_to_point(lines.direction[:, None], lines.moment[:, None], truth)
+    true_direction, _ = plucker.plucker_from_endpoints(truth)
+    sine = np.linalg.norm(np.cross(true_direction, lines.direction), axis=-1)
+    distance_m = np.linalg.norm(feet - truth, axis=-1).max(axis=-1)
+    return np.stack([distance_m, np.arcsin(np.minimum(sine, 1.0))], axis=-1)
+
+
+def perturbed(lines, angle_rad, offset_m, seed=0):
+    """Lines turned and moved by random amounts of these sizes."""
+    rng = np.random.default_rng(seed)
+    turn = rotation_from_vector(angle_rad * unit_rows(rng, len(lines)))
+    direction = np.einsum("lij,lj->li", turn, lines.direction)
+    point = plucker.nearest_to_origin(lines.direction, lines.moment)
+    point = point + offset_m * unit_rows(rng, len(lines))
+    return InfiniteLines(direction=direction, moment=plucker.moment_from_point(point, direction))
+
+
+def unit_rows(rng, count):
+    rows = rng.standard_normal((count, 3))
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
