@@ -39,6 +39,8 @@ EMPTY_DENSITY_PER_PX = 0.02
 MIN_EVENTS_PER_PX = 0.5
 # Cosine of the largest turn of a random plane's slice against its seed: 60 degrees.
 MIN_FACING = 0.5
+# Length of the image part of a unit normal below which a plane is an instant, not a moving line.
+MIN_IMAGE_PART = 1e-3
 
 
 class Grid(NamedTuple):
@@ -525,7 +527,7 @@ def fit_by_ransac(
         # The smallest eigenvector of the scatter is the normal of the total least squares plane.
         a, b, c = np.linalg.eigh(spread.T @ spread)[1][:, 0]
         in_image = np.sqrt(a * a + b * b)
-        if abs(b) < MIN_FACING * in_image:
+        if in_image < MIN_IMAGE_PART or abs(b) < MIN_FACING * in_image:
             continue
         # The normal points to the left of the seed, so that speeds count along that side.
         in_image = np.copysign(in_image, b)
