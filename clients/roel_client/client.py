@@ -146,8 +146,11 @@ class Client:
         request = maps_pb2.BuildMapRequest(
             parent=map_name, event_stream=stream, config=config_to_proto(config)
         )
-        operation = self._connection.call(self._maps.BuildMap, request)
-        return Operation(self._connection, operation.name)
+        return self.operation(self._connection.call(self._maps.BuildMap, request).name)
+
+    def operation(self, name: str) -> Operation:
+        """A build that was begun before, perhaps by somebody else."""
+        return Operation(self._connection, name)
 
     def map_version(self, name: str) -> maps_pb2.MapVersion:
         """One version of a map; its last part may be `latest`."""

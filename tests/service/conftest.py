@@ -1,6 +1,7 @@
 import pytest
 
 from roel_client import Client
+from roel_client.connection import Connection
 
 from .processes import Server
 
@@ -23,3 +24,11 @@ def server(tmp_path_factory):
 def client(server):
     with Client(server.address) as connected:
         yield connected
+
+
+@pytest.fixture(scope="module")
+def connection(server):
+    """For calls that the client does not make."""
+    opened = Connection(server.address)
+    yield opened
+    opened.close()

@@ -13,7 +13,7 @@ from roel_service.errors import (
     TrajectoryError,
 )
 from roel_service.scene.camera import Camera
-from roel_service.v1 import events_pb2, types_pb2
+from roel_service.v1 import events_pb2, events_pb2_grpc, types_pb2
 from roel_service.wire.chunks import encode_chunk
 from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
 
@@ -28,24 +28,21 @@ def stream(client):
     return client.create_event_stream(new_id(), CAMERA)
 
 
+@pytest.fixture(scope="module")
+def stub(connection):
+    return events_pb2_grpc.EventStreamServiceStub(connection.channel)
+
+
 @pytest.fixture
-def call(client):
+def call(connection, stub):
     """A single call of the service by its name."""
-
-    def called(method, request):
-        return client._connection.call(getattr(client._streams, method), request)
-
-    return called
+    return lambda method, request: connection.call(getattr(stub, method), request)
 
 
 @pytest.fixture
-def upload(client):
+def upload(connection, stub):
     """A streaming call of the service by its name."""
-
-    def uploaded(method, *requests):
-        return client._connection.upload(getattr(client._streams, method), requests)
-
-    return uploaded
+    return lambda method, *requests: connection.upload(getattr(stub, method), requests)
 
 
 def header(stream):
@@ -242,13 +239,10 @@ def test_there_are_only_so_many_poses(client, stream, count):
     assert caught.value.reason == "TOO_MANY_POSES"
 
 
-def test_a_finalized_recording_takes_nothing_more(client):
+def test_a_finalized_recording_takes_nothing_more(client, upload):
     stream = ready_recording(client)
     with pytest.raises(StateError) as events:
-        client._connection.upload(
-            client._streams.AppendEvents,
-            [header(stream), chunk(1, encode_chunk(events_of(3, duration_us=10)))],
-        )
+        upload("AppendEvents", header(stream), chunk(1, encode_chunk(events_of(3))))
     with pytest.raises(StateError) as late_poses:
         client.upload_poses(stream, trajectory_of(3))
     assert events.value.reason == late_poses.value.reason == "STREAM_FINALIZED"

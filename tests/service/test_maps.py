@@ -1,15 +1,15 @@
 import pytest
 
-from roel_client.client import Operation
 from roel_service.errors import (
     ConfigError,
     ConflictError,
+    CorruptionError,
     InputError,
     NoAnswerError,
     NotFoundError,
     StateError,
 )
-from roel_service.v1 import config_pb2, maps_pb2
+from roel_service.v1 import config_pb2, maps_pb2, maps_pb2_grpc
 from roel_service.wire.results import report_from_proto
 from roel_service.wire.rlm import decode_map
 
@@ -37,13 +37,10 @@ def map_name(client):
 
 
 @pytest.fixture
-def call(client):
+def call(connection):
     """A single call of the service by its name."""
-
-    def called(method, request):
-        return client._connection.call(getattr(client._maps, method), request)
-
-    return called
+    stub = maps_pb2_grpc.MapServiceStub(connection.channel)
+    return lambda method, request: connection.call(getattr(stub, method), request)
 
 
 def test_a_new_map_has_no_version(client, call, map_name):
@@ -104,13 +101,13 @@ def test_present_fields_override_the_named_preset(client, call, map_name, stream
     request = maps_pb2.BuildMapRequest(
         parent=map_name, event_stream=stream, preset="paper", config=config
     )
-    operation = Operation(client._connection, call("BuildMap", request).name)
+    operation = client.operation(call("BuildMap", request).name)
     report = report_from_proto(operation.wait().report)
     assert report["config"]["frames"]["rate_hz"] == 12.5
     assert report["config"]["plane_fit"]["method"] == "ransac"
 
 
-def test_a_configuration_that_cannot_be_is_refused_at_once(client, call, map_name, stream):
+def test_a_configuration_that_cannot_be_is_refused_at_once(call, map_name, stream):
     config = config_pb2.MappingConfig()
     config.frames.rate_hz = -1.0
     request = maps_pb2.BuildMapRequest(parent=map_name, event_stream=stream, config=config)
@@ -134,6 +131,17 @@ def test_only_a_frozen_recording_with_poses_can_be_mapped(client, map_name):
         client.build_map(map_name, "projects/default/eventStreams/nowhere", config)
     assert not_finalized.value.reason == "STREAM_NOT_FINALIZED"
     assert no_poses.value.reason == "NO_POSES"
+
+
+def test_a_map_whose_bytes_were_changed_is_not_sent(server, client, stream):
+    version = client.build_map(client.create_map(new_id()), stream, config_of(QUICK)).wait()
+    sha256 = version.map.sha256
+    blob = server.folder / "blobs" / "sha256" / sha256[:2] / sha256[2:4] / sha256
+    data = blob.read_bytes()
+    blob.write_bytes(data[:-1])
+    with pytest.raises(CorruptionError, match=sha256):
+        client.download_map(version.name)
+    blob.write_bytes(data)
 
 
 def test_ids_are_checked_and_unique(client):

@@ -60,15 +60,27 @@ def ended(client, stream):
 
 
 @pytest.fixture
-def call(client):
-    """A single call of the service by its name."""
-    stub = operations_pb2_grpc.OperationsStub(client._connection.channel)
+def call(connection):
+    """A single call of `google.longrunning.Operations` by its name."""
+    stub = operations_pb2_grpc.OperationsStub(connection.channel)
 
     def called(method, **fields):
         request = getattr(operations_pb2, f"{method}Request")(**fields)
-        return client._connection.call(getattr(stub, method), request)
+        return connection.call(getattr(stub, method), request)
 
     return called
+
+
+@pytest.fixture
+def watch(connection):
+    """All answers of a watch."""
+    stub = roel_operations_pb2_grpc.OperationServiceStub(connection.channel)
+
+    def watched(**fields):
+        request = roel_operations_pb2.WatchOperationRequest(**fields)
+        return list(connection.stream(stub.WatchOperation, request))
+
+    return watched
 
 
 def metadata_of(message):
@@ -98,12 +110,13 @@ def test_an_ended_operation_answers_with_its_version(ended, call):
     assert metadata.end_time.ToMicroseconds() >= metadata.create_time.ToMicroseconds()
 
 
-def test_a_watch_continues_after_the_last_change_that_was_seen(ended):
+def test_a_watch_continues_after_the_last_change_that_was_seen(ended, watch):
     operation, _, _ = ended
-    seen = operation._update_seq
-    request = roel_operations_pb2.WatchOperationRequest(name=operation.name, update_seq=seen)
-    answers = list(operation._connection.stream(operation._watching.WatchOperation, request))
-    assert [(answer.update_seq, answer.operation.done) for answer in answers] == [(seen, True)]
+    whole = watch(name=operation.name)
+    last = whole[-1].update_seq
+    rest = watch(name=operation.name, update_seq=last)
+    assert [(answer.update_seq, answer.operation.done) for answer in rest] == [(last, True)]
+    assert rest[0] == whole[-1]
 
 
 def test_cancelling_what_has_ended_changes_nothing(ended, call):
@@ -209,8 +222,6 @@ def test_other_operations_are_not_found(call, method, name, kind):
         call(method, name=name)
 
 
-def test_watching_another_operation_is_refused(client):
-    stub = roel_operations_pb2_grpc.OperationServiceStub(client._connection.channel)
-    request = roel_operations_pb2.WatchOperationRequest(name=NOWHERE)
+def test_watching_another_operation_is_refused(watch):
     with pytest.raises(NotFoundError):
-        list(client._connection.stream(stub.WatchOperation, request))
+        watch(name=NOWHERE)
