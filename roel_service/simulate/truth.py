@@ -1,0 +1,112 @@
+"""What a perfect map would hold: edges that can be seen, and the surfaces as points."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray
+from roel_service.geometry import projection
+from roel_service.geometry.se3 import SE3
+from roel_service.progress import StepCallback
+from roel_service.simulate.panoramas import FACE_ROTATIONS
+from roel_service.simulate.render import render, render_depth
+from roel_service.simulate.scenes import Scene, TextureAtlas
+
+# Voxels of edge points, and how many views must agree on one.
+EDGE_VOXEL_M = 0.005
+MIN_VIEW_COUNT = 2
+# Views for the edges have this many times the sensor's resolution.
+EDGE_ZOOM = 2
+# Canny thresholds, in grey values of a picture with gamma.
+CANNY_LOW, CANNY_HIGH = 30, 70
+# The cloud: noise, voxel, and size of the views.
+CLOUD_NOISE_M = 0.005
+CLOUD_VOXEL_M = 0.02
+CLOUD_VIEW_PX = 320
+
+
+def observable_edges(
+    scene: Scene,
+    atlas: TextureAtlas,
+    T_world_camera: SE3,
+    K: FloatArray,
+    width: int,
+    height: int,
+    scale: float,
+    progress: StepCallback,
+) -> Array:
+    """(M, 3) float32 m: edges of rendered views, lifted by their depth, seen at least twice.
+
+    Args:
+        scene, atlas: surfaces and their brightness.
+        T_world_camera: (N) views.
+        K, width, height: of the sensor.
+        scale: of the voxels, in units of a room.
+        progress: called for every view.
+    """
+    voxel_m = EDGE_VOXEL_M * scale
+    zoomed = K * EDGE_ZOOM
+    # Pixel centres are at integers: the corner of the image, at -1/2, is what stays in place.
+    zoomed[:2, 2] += 0.5 * (EDGE_ZOOM - 1)
+    zoomed[2, 2] = 1.0
+    seen = []
+    for view in range(len(T_world_camera)):
+        progress(view, len(T_world_camera))
+        points = _edge_points(scene, atlas, T_world_camera[view], zoomed, width, height)
+        seen.append(np.unique(_indices(points, voxel_m), axis=0))
+    voxels, counts = np.unique(np.concatenate(seen), axis=0, return_counts=True)
+    return np.asarray((voxels[counts >= MIN_VIEW_COUNT] + 0.5) * voxel_m, dtype=np.float32)
+
+
+def _edge_points(
+    scene: Scene, atlas: TextureAtlas, T_world_camera: SE3, K: FloatArray, width: int, height: int
+) -> FloatArray:
+    """(n, 3) m, world, of the Canny edges of one view."""
+    picture = render(scene, atlas, T_world_camera, K, width * EDGE_ZOOM, height * EDGE_ZOOM)
+    grey = np.rint(255.0 * picture.colour[..., 0].clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    # An edge belongs to the nearer of the surfaces that meet in it.
+    nearest_m = cv2.erode(picture.depth_m, np.ones((3, 3)))
+    rows, columns = np.nonzero(cv2.Canny(grey, CANNY_LOW, CANNY_HIGH))
+    hit = np.isfinite(nearest_m[rows, columns])
+    return _lifted(rows[hit], columns[hit], nearest_m, K, T_world_camera)
+
+
+def surface_cloud(
+    scene: Scene, places: FloatArray, scale: float, rng: np.random.Generator
+) -> Array:
+    """(N, 3) float32 m: surfaces as a depth camera would see them; one noisy point a voxel.
+
+    Args:
+        scene: surfaces.
+        places: (P, 3) m, from which all directions are looked at.
+        scale: of noise and voxels, in units of a room.
+        rng: draws the noise.
+    """
+    middle = (CLOUD_VIEW_PX - 1) / 2
+    half = CLOUD_VIEW_PX / 2
+    K = np.array([[half, 0, middle], [0, half, middle], [0, 0, 1.0]])
+    points = []
+    for place in places:
+        for R_world_camera in FACE_ROTATIONS:
+            T_world_camera = SE3(rotation=R_world_camera, translation=place)
+            depth_m = render_depth(scene, T_world_camera, K, CLOUD_VIEW_PX, CLOUD_VIEW_PX)
+            rows, columns = np.nonzero(np.isfinite(depth_m))
+            points.append(_lifted(rows, columns, depth_m, K, T_world_camera))
+    cloud = np.concatenate(points)
+    first = np.unique(_indices(cloud, CLOUD_VOXEL_M * scale), axis=0, return_index=True)[1]
+    noise = rng.normal(scale=CLOUD_NOISE_M * scale, size=(len(first), 3))
+    return np.asarray(cloud[np.sort(first)] + noise, dtype=np.float32)
+
+
+def _lifted(
+    rows: Array, columns: Array, depth_m: FloatArray, K: FloatArray, T_world_camera: SE3
+) -> FloatArray:
+    """(n, 3) world points of pixels with a depth."""
+    xy = projection.normalized_from_pixel(np.stack([columns, rows], axis=-1), K)
+    in_camera = np.column_stack([xy, np.ones(len(xy))]) * depth_m[rows, columns, None]
+    return T_world_camera @ in_camera
+
+
+def _indices(points: FloatArray, voxel_m: float) -> Array:
+    return np.floor(points / voxel_m).astype(np.int64)
