@@ -8,7 +8,7 @@ from typing import Any
 
 from google.protobuf.empty_pb2 import Empty
 
-from roel_service.errors import EventsError, InputError, LimitError
+from roel_service.errors import EventsError, InputError, LimitError, TrajectoryError
 from roel_service.scene.camera import Camera
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
@@ -18,9 +18,12 @@ from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import events_pb2, types_pb2
 from roel_service.wire import names
 from roel_service.wire.chunks import decode_chunk
-from roel_service.wire.nouns import camera_from_proto, trajectory_from_proto, trajectory_to_proto
-
-POSE_BYTES = 8 * (1 + 3 + 9)
+from roel_service.wire.nouns import (
+    camera_from_proto,
+    trajectory_columns,
+    trajectory_from_proto,
+    trajectory_to_proto,
+)
 
 
 class EventStreamServicer:
@@ -58,13 +61,13 @@ class EventStreamServicer:
     ) -> events_pb2.EventStream:
         stream_id = await _stream_id(requests)
         parts: list[types_pb2.Trajectory] = []
-        size_bytes = 0
+        pose_count = 0
         async for request in requests:
             parts.append(_part(request, "poses").poses)
-            size_bytes += parts[-1].ByteSize()
-            if size_bytes > POSE_BYTES * self._settings.pose_count + 4096:
+            pose_count += _checked_count(parts[-1])
+            if pose_count > self._settings.pose_count:
                 expected = f"at most {self._settings.pose_count}"
-                raise LimitError("poses", expected, "more", reason="TOO_MANY_POSES")
+                raise LimitError("poses", expected, f"{pose_count}", reason="TOO_MANY_POSES")
         record = await asyncio.to_thread(self._append_poses, stream_id, parts)
         return event_stream_to_proto(record)
 
@@ -124,6 +127,14 @@ def _part(request: Any, name: str) -> Any:
     if found != name:
         raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
     return request
+
+
+def _checked_count(poses: types_pb2.Trajectory) -> int:
+    """How many poses a message holds; every message holds some, so that their number is bounded."""
+    t_us, _, _ = trajectory_columns(poses)
+    if len(t_us) == 0:
+        raise TrajectoryError("poses", "at least one in every message", "none")
+    return len(t_us)
 
 
 def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:

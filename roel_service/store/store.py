@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from roel_service.errors import StateError
+from roel_service.errors import InputError, StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.builds import Builds
 from roel_service.store.database import Database
@@ -25,11 +26,12 @@ class Store:
         event_streams, maps, builds: the repositories.
 
     Raises:
+        InputError: a folder that cannot be created or written.
         StateError: DATA_IN_USE, another server has the folder; DATA_TOO_NEW.
     """
 
     def __init__(self, folder: Path) -> None:
-        make_folder(folder)
+        _check_folder(folder)
         with ExitStack() as resources:
             resources.enter_context(_locked(folder))
             self._database = Database(folder / "rows.sqlite")
@@ -54,6 +56,16 @@ class Store:
         with self._database.read() as connection:
             self._blobs.sweep(referenced(connection))
         self._recordings.sweep(self.event_streams.open_uids())
+
+
+def _check_folder(folder: Path) -> None:
+    """Create the folder if need be; raises `InputError` unless it can be written."""
+    try:
+        make_folder(folder)
+    except OSError as error:
+        raise InputError(str(folder), "a data folder", f"{error.strerror}") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(str(folder), "a data folder that can be written", "no permission")
 
 
 @contextmanager

@@ -138,9 +138,10 @@ def test_ids_and_cameras_are_checked(client, call):
     with pytest.raises(ConflictError) as taken:
         client.create_event_stream(stream_id, CAMERA)
     assert taken.value.reason == "ALREADY_EXISTS"
-    with pytest.raises(InputError) as named:
-        client.create_event_stream("No", CAMERA)
-    assert named.value.reason == "ID_INVALID"
+    for bad in ("No", "\U0001f600" * 10_000):
+        with pytest.raises(InputError) as named:
+            client.create_event_stream(bad, CAMERA)
+        assert named.value.reason == "ID_INVALID"
     request = events_pb2.CreateEventStreamRequest(
         parent="projects/default",
         event_stream_id=new_id(),
@@ -226,6 +227,8 @@ def test_poses_are_checked(client, upload, stream):
     bad.rotation = np.zeros((5, 3, 3)).tobytes()
     with pytest.raises(TrajectoryError):
         upload("AppendPoses", pose_header(stream), events_pb2.AppendPosesRequest(poses=bad))
+    with pytest.raises(TrajectoryError, match="at least one in every message"):
+        upload("AppendPoses", pose_header(stream), events_pb2.AppendPosesRequest(poses={}))
     client.upload_poses(stream, trajectory)
     with pytest.raises(TrajectoryError, match="poses after 20000 us"):
         client.upload_poses(stream, trajectory)

@@ -1,3 +1,4 @@
+import asyncio
 import json
 import os
 import re
@@ -17,9 +18,9 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
 from roel_client import Client
 from roel_client.connection import Connection
 from roel_service import __version__
-from roel_service.errors import RoelError, UnavailableError
+from roel_service.errors import InputError, RoelError, UnavailableError
 from roel_service.scene.results import MAPPING_STAGES
-from roel_service.service.server import SERVICES
+from roel_service.service.server import SERVICES, serve
 from roel_service.v1 import events_pb2, events_pb2_grpc
 from roel_service.wire.chunks import encode_chunk, split_chunks
 
@@ -112,13 +113,15 @@ def test_a_folder_serves_one_server(server):
 
 
 def test_a_taken_port_is_told(server, folder):
-    said = refused(*command(folder, "--port", str(server.port)))
-    assert f"{server.address}: expected a free address" in said
+    with pytest.raises(UnavailableError, match=f"{server.address}: expected a free address"):
+        asyncio.run(serve(folder, "127.0.0.1", server.port, on_ready=print))
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "example.org"])
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_only_loopback_is_served_without_encryption(folder, host):
-    assert "--host: expected a loopback address" in refused(*command(folder, "--host", host))
+    with pytest.raises(InputError, match="--host: expected a loopback address") as caught:
+        asyncio.run(serve(folder, host, 0, on_ready=print))
+    assert caught.value.reason == "INSECURE_HOST"
     assert not folder.exists()
 
 

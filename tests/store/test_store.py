@@ -3,7 +3,7 @@ from contextlib import closing
 
 import pytest
 
-from roel_service.errors import StateError
+from roel_service.errors import InputError, StateError
 from roel_service.store.store import Store
 
 from .samples import CAMERA, finalized
@@ -25,6 +25,14 @@ def test_a_folder_belongs_to_one_process_at_a_time(store, folder):
         Store(folder)
     assert caught.value.reason == "DATA_IN_USE"
     assert str(folder) in str(caught.value)
+
+
+def test_a_file_is_no_data_folder(tmp_path):
+    file = tmp_path / "file"
+    file.write_text("not a folder")
+    for place in (file, file / "below"):
+        with pytest.raises(InputError, match="expected a data folder"):
+            Store(place)
 
 
 def test_a_closed_folder_can_be_opened_again(folder):
