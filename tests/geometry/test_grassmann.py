@@ -287,7 +287,7 @@ def test_event_residual_ignores_rigid_motion_and_follows_the_sign_of_the_line(dr
     # Moments of a few m, rounded at 1e-15, over the smallest distance of the line.
     np.testing.assert_allclose(moved, residual, rtol=0, atol=1e-12)
     mirrored = ray_line_residual(ray, pose, -direction, -moment)
-    np.testing.assert_allclose(mirrored, -residual, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(mirrored, -residual, rtol=0, atol=1e-12)
 
 
 def assert_ray_line_jacobians(pose, U, phi, ray, step, tol):
