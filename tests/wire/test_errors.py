@@ -1,3 +1,6 @@
+import re
+from pathlib import Path
+
 import pytest
 from google.rpc import code_pb2, status_pb2
 from hypothesis import given
@@ -12,6 +15,8 @@ from roel_service.wire.errors import (
     error_from_status,
     status_from_error,
 )
+
+ROOT = Path(__file__).parents[2]
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=MAX_TEXT_LENGTH)
 
@@ -85,3 +90,33 @@ def test_an_unknown_kind_of_error_is_still_an_error():
     restored = error_from_status(status)
     assert type(restored) is RoelError
     assert restored.args == ("s", "e", "f")
+
+
+def documented_reasons():
+    """Reason, class and code of every row of docs/errors.md."""
+    rows = re.findall(
+        r"^\| `(\w+)` \| `(\w+)` \| (\w+) \|", (ROOT / "docs" / "errors.md").read_text(), re.M
+    )
+    return {reason: (kind, code) for reason, kind, code in rows}
+
+
+def raised_reasons():
+    """Every reason that the source names."""
+    sources = [*(ROOT / "roel_service").rglob("*.py"), *(ROOT / "clients").rglob("*.py")]
+    texts = (path.read_text() for path in sources)
+    return {
+        name for text in texts for name in re.findall(r'reason(?:: [^=]*)? ?= ?"([A-Z_]+)"', text)
+    }
+
+
+def test_the_documented_reasons_are_those_that_can_be_raised():
+    assert set(documented_reasons()) == raised_reasons()
+
+
+def test_documented_codes_and_classes_are_true():
+    for kind, code in documented_reasons().values():
+        status = status_from_error(KINDS[kind]("subject", "expected", "found"))
+        assert code_pb2.Code.Name(status.code) == code
+    defaults = {kind.default_reason: name for name, kind in KINDS.items()}
+    for reason, name in defaults.items():
+        assert documented_reasons()[reason][0] == name
