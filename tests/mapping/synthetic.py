@@ -4,6 +4,7 @@ Everything is given for a world of size 1 m; `world(scale)` stretches lines and 
 leaves all images as they are.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,57 +95,54 @@ class World:
         )
 
 
-def world(
-    scale=1.0, segments_world=SEGMENTS_WORLD, frame_count=24, noise_px=0.0, event_noise_px=0.0
-):
+@functools.cache
+def world(scale=1.0, frame_count=24, noise_px=0.0, event_noise_px=0.0, lines=tuple(range(12))):
     """The edges, seen in every frame in which they are wholly in the image.
 
     Args:
         noise_px: standard deviation of the observed ends, across the segment.
         event_noise_px: of the supporting events.
+        lines: which of `SEGMENTS_WORLD` there are.
     """
-    truth = scale * np.asarray(segments_world)
+    truth = scale * SEGMENTS_WORLD[list(lines)]
     poses = trajectory(scale)
     t_us = np.linspace(20_000, DURATION_US - 20_000, frame_count).astype(np.int64)
     frames = frames_at(t_us, poses, CAMERA)
-    rng = np.random.default_rng(0)
-    found = observe(truth, poses, frames, rng, noise_px, event_noise_px)
-    observations, line_of = found
+    observations, line_of = observe(truth, poses, frames, noise_px, event_noise_px)
     return World(
         segments=truth, trajectory=poses, frames=frames, observations=observations, line_of=line_of
     )
 
 
-def observe(truth, poses, frames, rng, noise_px=0.0, event_noise_px=0.0, event_count=40):
+def observe(truth, poses, frames, noise_px=0.0, event_noise_px=0.0, event_count=40):
     """Exact 2D lines with speeds and supporting events, and the segment behind each of them."""
-    frame_of, line_of, projected, speeds, xy_px, dt_us = [], [], [], [], [], []
-    for frame, t_us in enumerate(frames.t_us):
-        T_camera_world = frames.T_world_camera[frame].inverse()
-        ends_px = projection.project(T_camera_world @ truth, frames.K)
-        for line in np.flatnonzero(in_image(ends_px)):
-            frame_of.append(frame)
-            line_of.append(line)
-            projected.append(ends_px[line])
-            speeds.append(normal_speed(truth[line], frame, poses, frames))
-            dt = np.sort(rng.integers(-2_000, 2_001, event_count))
-            dt = dt[np.argsort(np.abs(dt), kind="stable")]
-            xy_px.append(points_at(truth[line], rng.random(event_count), t_us + dt, poses))
-            dt_us.append(dt)
-    projected = np.array(projected)
-    shift_px = noise_px * rng.standard_normal((len(projected), 2))
-    events_px = np.concatenate(xy_px)
-    events_px = events_px + event_noise_px * rng.standard_normal(events_px.shape)
-    normal = segments.left_normal(projected)
+    rng = np.random.default_rng(0)
+    in_camera = frames.T_world_camera.inverse()[:, None, None] @ truth
+    ends_px = projection.project(in_camera, frames.K)
+    frame_of, line_of = np.nonzero(in_image(ends_px))
+    ends_px = ends_px[frame_of, line_of]
+    left = segments.left_normal(ends_px)
+    # Nearest in time first, as the plane fit leaves them.
+    dt_us = rng.integers(-500, 501, (len(frame_of), event_count))
+    dt_us = np.take_along_axis(dt_us, np.argsort(np.abs(dt_us), axis=1, kind="stable"), axis=1)
+    share = rng.random((*dt_us.shape, 1))
+    points = truth[line_of, None, 0] + share * (truth[line_of, None, 1] - truth[line_of, None, 0])
+    T_world_own = poses.interpolate((frames.t_us[frame_of, None] + dt_us).ravel())
+    events_px = projection.project(T_world_own.inverse() @ points.reshape(-1, 3), frames.K)
+    noise = noise_px * rng.standard_normal((len(frame_of), 2, 1))
+    event_noise = event_noise_px * rng.standard_normal(events_px.shape)
     observations = LineObservations(
-        frame=np.array(frame_of, np.int32),
-        segments_px=projected + shift_px[..., None] * normal[:, None],
-        polarity=np.where(np.array(line_of) % 2, 1, -1),
-        normal_speed_px_per_ms=np.array(speeds),
-        event_offsets=event_count * np.arange(len(projected) + 1),
-        event_xy_px=events_px.astype(np.float32),
-        event_dt_us=np.concatenate(dt_us).astype(np.int32),
+        frame=frame_of.astype(np.int32),
+        segments_px=ends_px + noise * left[:, None],
+        polarity=np.where(line_of % 2, 1, -1),
+        normal_speed_px_per_ms=normal_speeds(
+            ends_px, in_camera[frame_of, line_of], frame_of, poses, frames
+        ),
+        event_offsets=event_count * np.arange(len(frame_of) + 1),
+        event_xy_px=(events_px + event_noise).astype(np.float32),
+        event_dt_us=dt_us.ravel().astype(np.int32),
     )
-    return observations, np.array(line_of)
+    return observations, line_of
 
 
 def in_image(ends_px):
@@ -158,24 +156,53 @@ def points_at(segment, share, t_us, poses):
     return projection.project(poses.interpolate(t_us).inverse() @ points, CAMERA.matrix)
 
 
-def normal_speed(segment, frame, poses, frames):
-    """Speed in px/ms of the middle of the image of a segment, the camera's turn undone.
+def normal_speeds(ends_px, ends_camera, frame_of, poses, frames):
+    """(M,) px/ms of the middles of images of segments along their normals, the turn undone.
 
     A point at normalised (x, y) and depth z moves by f (x w_z - w_x, y w_z - w_y) / z a second
     when the camera moves by w (m/s, in its own axes).
     """
-    pose = frames.T_world_camera[frame]
-    t_us = frames.t_us[frame]
-    step = poses.interpolate(t_us + np.array([-1_000, 1_000])).translation
-    w = pose.inverse().rotate((step[1] - step[0]) / 2e-3)
-    ends = pose.inverse() @ segment
-    ends_px = projection.project(ends, frames.K)
-    middle = projection.normalized_from_pixel(ends_px.mean(axis=0), frames.K)
+    before, after = (poses.interpolate(frames.t_us + step_us) for step_us in (-1_000, 1_000))
+    velocity = (after.translation - before.translation) / 2e-3
+    w = frames.T_world_camera.inverse().rotate(velocity)[frame_of]
+    middle = projection.normalized_from_pixel(ends_px.mean(axis=1), frames.K)
     # The point of the segment that is seen at the middle of its image.
-    share = ends[0, 2] / ends[:, 2].sum()
-    depth_m = ends[0, 2] + share * (ends[1, 2] - ends[0, 2])
-    motion = frames.focal_px * (middle * w[2] - w[:2]) / depth_m
-    return segments.left_normal(ends_px) @ motion * 1e-3
+    depth_m = ends_camera[..., 2]
+    share = depth_m[:, 0] / depth_m.sum(axis=1)
+    middle_depth_m = depth_m[:, 0] + share * (depth_m[:, 1] - depth_m[:, 0])
+    motion = frames.focal_px * (middle * w[:, 2:] - w[:, :2]) / middle_depth_m[:, None]
+    return np.vecdot(segments.left_normal(ends_px), motion) * 1e-3
+
+
+def frames_of(T_world_camera, step_us=10_000):
+    """Frames of the camera at these poses."""
+    return Frames(
+        t_us=np.arange(len(T_world_camera)) * step_us,
+        T_world_camera=T_world_camera,
+        K=CAMERA.matrix,
+        width=CAMERA.width,
+        height=CAMERA.height,
+    )
+
+
+def still_frames(count, turn_rad=0.0):
+    """A camera in one place that turns about its vertical axis by `turn_rad` a frame."""
+    turn = np.arange(count)[:, None] * np.array([0.0, turn_rad, 0.0])
+    return frames_of(SE3(rotation=rotation_from_vector(turn), translation=np.zeros((count, 3))))
+
+
+def observed(*rows):
+    """Observations from rows (frame, segment, polarity, speed); without events."""
+    count = len(rows)
+    return LineObservations(
+        frame=np.array([row[0] for row in rows], np.int32),
+        segments_px=np.array([row[1] for row in rows], float).reshape(-1, 2, 2),
+        polarity=np.array([row[2] if len(row) > 2 else 1 for row in rows], np.int8),
+        normal_speed_px_per_ms=np.array([row[3] if len(row) > 3 else 0.0 for row in rows]),
+        event_offsets=np.zeros(count + 1, np.int64),
+        event_xy_px=np.empty((0, 2), np.float32),
+        event_dt_us=np.empty(0, np.int32),
+    )
 
 
 def moving_line_events(

@@ -286,13 +286,22 @@ class TestRefusal:
         wide = dataclasses.replace(VOTE, max_speed_widths_per_s=2.5)
         assert signed_speed(fit(seeds_at(SEGMENT_PX), frame, wide)) == pytest.approx(0.3, abs=1e-5)
 
-    def test_a_coarse_vote_loses_a_line_between_its_steps(self):
-        # Three steps are -0.09, 0 and 0.09 px/ms; over 20 ms, 0.045 px/ms are 0.9 px.
+    def test_a_fine_vote_tells_parallel_lines_apart(self):
         frame = event_frame_of(
-            moving_line_events(SEGMENT_PX, 0.075, half_window_ms=25.0, count=600), self.band(900)
+            *[
+                moving_line_events(
+                    beside(SEGMENT_PX, offset), 0.13, half_window_ms=25.0, seed=offset + 8
+                )
+                for offset in (-8, -4, 0, 4, 8)
+            ]
         )
-        fine = fit(seeds_at(beside(SEGMENT_PX, 0.5), polarity=[1]), frame, VOTE)
-        assert signed_speed(fine) == pytest.approx(0.075, abs=0.005)
+        fine = dataclasses.replace(VOTE, max_speed_widths_per_s=2.5, candidate_distance_px=8.0)
+        fitted = fit(seeds_at(SEGMENT_PX), frame, fine)
+        assert signed_speed(fitted) == pytest.approx(0.13, abs=1e-5)
+        assert offsets_px(fitted.segments_px[0], SEGMENT_PX) < EXACT_PX
+        # Two steps, -0.4 and 0.4 px/ms, see no difference between the line and its neighbours.
+        coarse = dataclasses.replace(fine, speed_count=2, min_density_ratio=0.0)
+        assert abs(signed_speed(fit(seeds_at(SEGMENT_PX), frame, coarse))) > 0.2
 
     def test_events_far_from_the_seed_are_no_candidates(self):
         frame = event_frame_of(moving_line_events(beside(SEGMENT_PX, 7.0), 0.0))
