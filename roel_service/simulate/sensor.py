@@ -50,8 +50,8 @@ class EventSensor:
         self._reference = self._before + offset
         self._last_us = np.full((height, width), -np.inf)
         hot = rng.random((height, width)) < model.hot_pixel_share
-        self._noise_hz = np.where(hot, model.hot_pixel_hz, model.shot_noise_hz)
-        self._noise_share = np.cumsum(self._noise_hz.ravel()) / self._noise_hz.sum()
+        noise_hz = np.where(hot, model.hot_pixel_hz, model.shot_noise_hz)
+        self._noise_total_hz = np.cumsum(noise_hz.ravel())
         self._now_us = 0
 
     def advance(self, picture: Array, stop_us: int) -> EventStream:
@@ -84,8 +84,9 @@ class EventSensor:
     def _noise(self, stop_us: int, width: int) -> tuple[Array, Array, Array, Array]:
         """Random events until `stop_us`: times, columns, rows and polarities."""
         duration_s = (stop_us - self._now_us) * 1e-6
-        count = int(self._rng.poisson(self._noise_hz.sum() * duration_s))
-        pixel = np.searchsorted(self._noise_share, self._rng.random(count))
+        count = int(self._rng.poisson(self._noise_total_hz[-1] * duration_s))
+        drawn_hz = self._rng.uniform(0.0, self._noise_total_hz[-1], size=count)
+        pixel = np.searchsorted(self._noise_total_hz, drawn_hz, side="right")
         return (
             self._rng.integers(self._now_us, stop_us, size=count),
             (pixel % width).astype(np.uint16),
