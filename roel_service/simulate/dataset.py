@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -85,7 +85,7 @@ class SimulationConfig:
     panorama_width: int = 2048
     scene: str = "room"
     mesh: Path | None = None
-    sensor: SensorModel = SensorModel()
+    sensor: SensorModel = field(default_factory=SensorModel)
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -142,7 +142,7 @@ def simulate_dataset(
     try:
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.absolute().parent))
     except OSError as error:
-        raise InputError(str(folder), "a folder that can be made", error.strerror) from error
+        raise InputError(str(folder), "a folder that can be made", str(error)) from error
     try:
         event_count = recording.write(temporary)
         temporary.chmod(0o755)
@@ -254,7 +254,7 @@ class _Recording:
         bounds_m = self.scene.bounds_m
         reach_m = PANORAMA_REACH * (bounds_m[1] - bounds_m[0])
         middle = np.append(bounds_m[:, :2].mean(axis=0), self.motion.centre[2])
-        return middle + rng.uniform(-1, 1, size=(count, 3)) * reach_m
+        return np.asarray(middle + rng.uniform(-1, 1, size=(count, 3)) * reach_m)
 
     def _write_panoramas(self, folder: Path) -> None:
         (folder / "panos").mkdir()
@@ -318,8 +318,9 @@ def _speed_px_per_us(
     rows, columns = np.nonzero(np.isfinite(depth_m))
     if len(rows) == 0:
         return 0.0
-    pixel = np.stack([columns, rows, np.ones(len(rows))], axis=-1)
-    in_world = poses[0] @ ((pixel @ np.linalg.inv(K).T) * depth_m[rows, columns, None])
+    pixel = np.stack([columns, rows, np.ones(len(rows))], axis=-1).astype(np.float64)
+    in_camera = (pixel @ np.linalg.inv(K).T) * depth_m[rows, columns, None]
+    in_world = poses[0] @ np.asarray(in_camera)
     moved = (poses[1].inverse() @ in_world) @ K.T
     step = np.linalg.norm(moved[:, :2] / moved[:, 2:] - pixel[:, :2], axis=1)
     return float(np.quantile(step, 1 - FAST_SHARE)) / MIN_INTERVAL_US

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -52,20 +53,21 @@ def scene_from_mesh(path: Path) -> Scene:
 
 def _surface(part: trimesh.Trimesh) -> tuple[FloatArray, Array]:
     """(T, 3, 2) texture coordinates and (H, W, 3) texture of one part."""
-    visual = part.visual
-    image = _picture(visual)
-    if image is not None and getattr(visual, "uv", None) is not None:
-        uv = np.asarray(visual.uv, dtype=np.float64)[part.faces]
-        # trimesh counts v upwards.
-        uv[..., 1] = 1.0 - uv[..., 1]
-        return uv, image
+    # trimesh's two kinds of visuals share no typed interface.
+    visual: Any = part.visual
     if visual.kind == "texture":
+        image = _picture(visual.material)
+        if image is not None and visual.uv is not None:
+            uv = np.asarray(visual.uv, dtype=np.float64)[part.faces]
+            # trimesh counts v upwards.
+            uv[..., 1] = 1.0 - uv[..., 1]
+            return uv, image
         visual = visual.to_color()
     return _palette(_linear(np.asarray(visual.face_colors)[:, :3]), len(part.faces))
 
 
-def _picture(visual: object) -> Array | None:
-    material = getattr(visual, "material", None)
+def _picture(material: Any) -> Array | None:
+    """The texture of a material, of either kind that trimesh knows."""
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     return None if image is None else _linear(np.asarray(image.convert("RGB")))
 

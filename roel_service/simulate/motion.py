@@ -79,7 +79,7 @@ class Motion:
 
     def poses(self, t_us: IntArray) -> SE3:
         """(N) `T_world_camera` at (N,) times."""
-        t_s = np.asarray(t_us) * 1e-6
+        t_s = np.asarray(t_us * 1e-6, dtype=np.float64)
         angle = self.first_angle_rad + 2 * np.pi * t_s / TURN_S
         around = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)
         position = self.centre + around * np.append(self.radius_m, 0.0) + self.shake_m.at(t_s)

@@ -18,6 +18,7 @@ from roel_service.simulate.scenes import Scene, TextureAtlas
 # Positions of the samples in a pixel: every row and every column of a 6 x 6 grid holds one, so that
 # upright and level edges, too, pass six steps on their way through a pixel.
 SAMPLE_OFFSETS = (np.array([[0, 3], [1, 0], [2, 4], [3, 1], [4, 5], [5, 2]]) + 0.5) / 6 - 0.5
+CENTRE = np.zeros(2)
 # Surfaces nearer than this are cut away, in units of the scene's longest side.
 NEAR_SHARE = 1e-3
 
@@ -53,67 +54,74 @@ def render(
         K: (3, 3) calibration matrix, px.
         width, height: px.
     """
-    image, counts, functions, order = _project(scene, T_world_camera, K, width, height)
+    triangles = _project(scene, T_world_camera, K, width, height)
+    visible = np.empty((len(SAMPLE_OFFSETS), height, width), np.int32)
+    for sample, place in enumerate(SAMPLE_OFFSETS):
+        visible[sample] = _visible(triangles, width, height, place)[1]
     colour = np.zeros((height, width, atlas.texels.shape[1]), np.float32)
-    # A sample's footprint has the side of a pixel over the root of their number.
-    sharpness = 0.5 * np.log2(len(SAMPLE_OFFSETS))
-    for offset_x, offset_y in SAMPLE_OFFSETS:
-        _, visible = _visible(image, counts, functions, order, width, height, offset_x, offset_y)
-        render_kernels.shade(
-            visible,
-            functions,
-            scene.texture,
-            scene.brightness,
-            atlas.texels,
-            atlas.offset,
-            atlas.height,
-            atlas.width,
-            atlas.level_count,
-            offset_x,
-            offset_y,
-            sharpness,
-            scene.background,
-            colour,
-        )
-    nearest, _ = _visible(image, counts, functions, order, width, height, 0.0, 0.0)
-    return Picture(colour=colour / len(SAMPLE_OFFSETS), depth_m=_depth(nearest))
+    render_kernels.shade(
+        visible,
+        SAMPLE_OFFSETS,
+        triangles.functions,
+        scene.texture,
+        scene.brightness,
+        atlas.texels,
+        atlas.offset,
+        atlas.height,
+        atlas.width,
+        atlas.level_count,
+        scene.background,
+        colour,
+    )
+    nearest, _ = _visible(triangles, width, height, CENTRE)
+    return Picture(colour=colour, depth_m=_depth(nearest))
 
 
 def render_depth(
     scene: Scene, T_world_camera: SE3, K: FloatArray, width: int, height: int
 ) -> FloatArray:
     """(H, W) z in the camera, m, at the pixel centres; infinite where nothing is hit."""
-    image, counts, functions, order = _project(scene, T_world_camera, K, width, height)
-    return _depth(_visible(image, counts, functions, order, width, height, 0.0, 0.0)[0])
+    triangles = _project(scene, T_world_camera, K, width, height)
+    return _depth(_visible(triangles, width, height, CENTRE)[0])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Projected:
+    """Triangles in the image, see `render_kernels.project_triangles`."""
+
+    image: Array
+    counts: Array
+    functions: Array
+    order: Array
 
 
 def _project(
     scene: Scene, T_world_camera: SE3, K: FloatArray, width: int, height: int
-) -> tuple[Array, Array, Array, Array]:
+) -> _Projected:
     in_camera = T_world_camera.inverse() @ scene.triangles
     corners = np.concatenate([in_camera, scene.uv], axis=-1)
     near_m = NEAR_SHARE * float(np.ptp(scene.bounds_m, axis=0).max())
-    projected: tuple[Array, Array, Array, Array] = render_kernels.project_triangles(
+    image, counts, functions, order = render_kernels.project_triangles(
         corners, K, near_m, width, height
     )
-    return projected
+    return _Projected(image=image, counts=counts, functions=functions, order=order)
 
 
 def _visible(
-    image: Array,
-    counts: Array,
-    functions: Array,
-    order: Array,
-    width: int,
-    height: int,
-    offset_x: float,
-    offset_y: float,
+    triangles: _Projected, width: int, height: int, place: FloatArray
 ) -> tuple[Array, Array]:
-    """Inverse depth (H, W) and triangle (H, W) at one position of every pixel."""
+    """Inverse depth (H, W) and triangle (H, W) at one (2,) place of every pixel."""
     nearest = np.zeros((height, width))
-    visible = np.full((height, width), -1, np.int64)
+    visible = np.full((height, width), -1, np.int32)
     render_kernels.fill_triangles(
-        image, counts, functions, order, offset_x, offset_y, nearest, visible
+        triangles.image,
+        triangles.counts,
+        triangles.functions,
+        triangles.order,
+        place[0],
+        place[1],
+        nearest,
+        visible,
     )
     return nearest, visible
 

@@ -163,28 +163,52 @@ def fill_triangles(
 
 
 @numba.njit(cache=True, nogil=True)
-def texel(
-    texels: Array, offset: int, height: int, width: int, u: float, v: float, colour: Array
+def add_texel(
+    texels: Array,
+    offset: int,
+    height: int,
+    width: int,
+    u: float,
+    v: float,
+    weight: float,
+    total: Array,
 ) -> None:
-    """Write the bilinear value of one repeating texture level to `colour` (C,)."""
-    x, y = u * width - 0.5, v * height - 0.5
+    """Add the weighted bilinear value of one texture level to `total` (C,); the level repeats."""
+    x, y = (u - np.floor(u)) * width - 0.5, (v - np.floor(v)) * height - 0.5
     column, row = int(np.floor(x)), int(np.floor(y))
     fx, fy = x - column, y - row
-    left, right = column % width, (column + 1) % width
-    top, bottom = (row % height) * width, ((row + 1) % height) * width
-    for channel in range(len(colour)):
-        upper = (1 - fx) * texels[offset + top + left, channel] + fx * texels[
-            offset + top + right, channel
-        ]
-        lower = (1 - fx) * texels[offset + bottom + left, channel] + fx * texels[
-            offset + bottom + right, channel
-        ]
-        colour[channel] = (1 - fy) * upper + fy * lower
+    left = column if column >= 0 else width - 1
+    right = column + 1 if column + 1 < width else 0
+    top = offset + (row if row >= 0 else height - 1) * width
+    bottom = offset + (row + 1 if row + 1 < height else 0) * width
+    for channel in range(len(total)):
+        upper = texels[top + left, channel] * (1 - fx) + texels[top + right, channel] * fx
+        lower = texels[bottom + left, channel] * (1 - fx) + texels[bottom + right, channel] * fx
+        total[channel] += weight * (upper * (1 - fy) + lower * fy)
+
+
+@numba.njit(cache=True, nogil=True)
+def texture_place(f: Array, x: float, y: float) -> tuple[float, float, float]:
+    """u, v and depth of a triangle at a pixel, by its linear functions."""
+    z = 1.0 / (f[0, 0] * x + f[0, 1] * y + f[0, 2])
+    u = (f[1, 0] * x + f[1, 1] * y + f[1, 2]) * z
+    v = (f[2, 0] * x + f[2, 1] * y + f[2, 2]) * z
+    return u, v, z
+
+
+@numba.njit(cache=True, nogil=True)
+def footprint_texels(f: Array, u: float, v: float, z: float, height: int, width: int) -> float:
+    """Size of a pixel on the texture, in texels along the longer direction."""
+    size_u, size_v = width * z, height * z
+    along_x = abs(f[1, 0] - u * f[0, 0]) * size_u + abs(f[2, 0] - v * f[0, 0]) * size_v
+    along_y = abs(f[1, 1] - u * f[0, 1]) * size_u + abs(f[2, 1] - v * f[0, 1]) * size_v
+    return float(max(along_x, along_y))
 
 
 @numba.njit(cache=True, nogil=True)
 def shade(
     visible: Array,
+    sample_offsets: Array,
     functions: Array,
     texture: Array,
     brightness: Array,
@@ -193,54 +217,82 @@ def shade(
     height: Array,
     width: Array,
     level_count: Array,
-    offset_x: float,
-    offset_y: float,
-    sharpness: float,
     background: float,
-    total: Array,
+    colour: Array,
 ) -> None:
-    """Add the colour of one sample of every pixel.
+    """Write the mean colour of the samples of every pixel.
 
-    Texture levels are blended by the size of the sample's footprint in texels.
+    Texture levels are blended by the size of a sample's footprint. Where all samples hit one
+    triangle whose texels are larger than the pixel, the texture is linear over the pixel and its
+    middle is the mean.
 
     Args:
-        visible: (H, W) triangle, -1 for none.
+        visible: (S, H, W) triangle of each sample, -1 for none.
+        sample_offsets: (S, 2) positions in the pixel.
         functions: (T, 3, 3) linear functions.
         texture: (T,) texture of each triangle.
         brightness: (T,) factor of its texture.
         texels, offset, height, width, level_count: a `TextureAtlas`.
-        offset_x, offset_y: position of the sample in its pixel.
-        sharpness: levels to stay below that of a whole pixel's footprint.
         background: colour of what hits nothing.
-        total: (H, W, C) added to.
+        colour: (H, W, C) added to.
     """
-    fine = np.empty(total.shape[2], np.float32)
-    coarse = np.empty(total.shape[2], np.float32)
-    for row in range(visible.shape[0]):
-        y = row + offset_y
-        for column in range(visible.shape[1]):
-            t = visible[row, column]
-            if t < 0:
-                total[row, column] += background
-                continue
-            x = column + offset_x
-            f = functions[t]
-            z = 1.0 / (f[0, 0] * x + f[0, 1] * y + f[0, 2])
-            u = (f[1, 0] * x + f[1, 1] * y + f[1, 2]) * z
-            v = (f[2, 0] * x + f[2, 1] * y + f[2, 2]) * z
-            k = texture[t]
-            size_u, size_v = width[k, 0] * z, height[k, 0] * z
-            along_x = abs(f[1, 0] - u * f[0, 0]) * size_u + abs(f[2, 0] - v * f[0, 0]) * size_v
-            along_y = abs(f[1, 1] - u * f[0, 1]) * size_u + abs(f[2, 1] - v * f[0, 1]) * size_v
-            footprint = max(along_x, along_y, 1e-9)
-            level = min(max(np.log2(footprint) - sharpness, 0.0), level_count[k] - 1.0)
-            below = int(level)
-            above = min(below + 1, level_count[k] - 1)
-            texel(texels, offset[k, below], height[k, below], width[k, below], u, v, fine)
-            share = level - below
-            if share > 0.0:
-                texel(texels, offset[k, above], height[k, above], width[k, above], u, v, coarse)
-                for channel in range(len(fine)):
-                    fine[channel] += share * (coarse[channel] - fine[channel])
-            for channel in range(len(fine)):
-                total[row, column, channel] += brightness[t] * fine[channel]
+    sample_count = len(visible)
+    # A sample stands for a part of the pixel whose side is smaller by the root of their number.
+    sharpness = 0.5 * np.log2(sample_count)
+    for row in range(visible.shape[1]):
+        for column in range(visible.shape[2]):
+            total = colour[row, column]
+            first = visible[0, row, column]
+            same = first >= 0
+            for sample in range(1, sample_count):
+                same = same and visible[sample, row, column] == first
+            if same:
+                k = texture[first]
+                u, v, z = texture_place(functions[first], column, row)
+                size = footprint_texels(functions[first], u, v, z, height[k, 0], width[k, 0])
+                if size < 1.0 or level_count[k] == 1:
+                    place = offset[k, 0]
+                    add_texel(
+                        texels, place, height[k, 0], width[k, 0], u, v, brightness[first], total
+                    )
+                    continue
+            for sample in range(sample_count):
+                t = visible[sample, row, column]
+                if t < 0:
+                    total += background / sample_count
+                    continue
+                k = texture[t]
+                weight = brightness[t] / sample_count
+                x, y = column + sample_offsets[sample, 0], row + sample_offsets[sample, 1]
+                u, v, z = texture_place(functions[t], x, y)
+                level = 0.0
+                if level_count[k] > 1:
+                    size = footprint_texels(functions[t], u, v, z, height[k, 0], width[k, 0])
+                    level = np.log2(max(size, 1e-9)) - sharpness
+                    level = min(max(level, 0.0), level_count[k] - 1.0)
+                below = int(level)
+                share = level - below
+                place = offset[k, below]
+                add_texel(
+                    texels,
+                    place,
+                    height[k, below],
+                    width[k, below],
+                    u,
+                    v,
+                    weight * (1.0 - share),
+                    total,
+                )
+                if share > 0.0:
+                    above = below + 1
+                    place = offset[k, above]
+                    add_texel(
+                        texels,
+                        place,
+                        height[k, above],
+                        width[k, above],
+                        u,
+                        v,
+                        weight * share,
+                        total,
+                    )

@@ -62,7 +62,7 @@ def brightness_of(triangles: FloatArray) -> Array:
     """(T,) light on (T, 3, 3) triangles, 1 where they face it."""
     normal = unit(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]))
     facing = np.nan_to_num(normal) @ (LIGHT / np.linalg.norm(LIGHT))
-    return (AMBIENT + (1.0 - AMBIENT) * facing).astype(np.float32)
+    return np.asarray(AMBIENT + (1.0 - AMBIENT) * facing, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -116,5 +116,5 @@ def _levels(image: Array) -> list[Array]:
     while max(levels[-1].shape[:2]) > 1:
         height, width = (max(1, size // 2) for size in levels[-1].shape[:2])
         smaller = cv2.resize(levels[-1], (width, height), interpolation=cv2.INTER_AREA)
-        levels.append(smaller.reshape(height, width, -1))
+        levels.append(np.asarray(smaller, np.float32).reshape(height, width, -1))
     return levels

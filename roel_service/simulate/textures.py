@@ -21,7 +21,7 @@ def mottled(colour: Array, contrast: float, size_px: int, rng: np.random.Generat
     noise = rng.normal(size=(size_px, size_px, 1)).astype(np.float32)
     soft = cv2.GaussianBlur(noise, (0, 0), 0.06 * size_px, borderType=cv2.BORDER_REFLECT)
     soft = (soft / soft.std())[..., None] * contrast
-    return np.clip(colour * (1.0 + soft), 0.02, 1.0).astype(np.float32)
+    return np.asarray(np.clip(colour * (1.0 + soft), 0.02, 1.0), dtype=np.float32)
 
 
 def planks(board_count: int, rng: np.random.Generator) -> Array:

@@ -66,7 +66,7 @@ def _edge_points(
     picture = render(scene, atlas, T_world_camera, K, width * EDGE_ZOOM, height * EDGE_ZOOM)
     grey = np.rint(255.0 * picture.colour[..., 0].clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
     # An edge belongs to the nearer of the surfaces that meet in it.
-    nearest_m = cv2.erode(picture.depth_m, np.ones((3, 3)))
+    nearest_m = np.asarray(cv2.erode(picture.depth_m, np.ones((3, 3))), dtype=np.float64)
     rows, columns = np.nonzero(cv2.Canny(grey, CANNY_LOW, CANNY_HIGH))
     hit = np.isfinite(nearest_m[rows, columns])
     return _lifted(rows[hit], columns[hit], nearest_m, K, T_world_camera)
