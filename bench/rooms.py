@@ -38,7 +38,7 @@ def main() -> None:
 def simulated(folder: Path, seed: int, seconds: float) -> Path:
     """A new room."""
     room = folder / f"room_{seed}"
-    local.simulate(room, seed, ignore, seconds=seconds, panoramas=0)
+    local.simulate(room, seed, ignore, seconds=seconds, panorama_count=0)
     return room
 
 

@@ -152,6 +152,18 @@ def _read_map(name: str) -> LineMap:
     return read_map_file(name).line_map if is_map_file else read_exported_map(Path(name))
 
 
+def simulate(folder: Path, seed: int, progress: ProgressCallback, **given: Any) -> int:
+    """Write a synthetic recording with its truth; number of its events.
+
+    Args:
+        folder: must not exist, or be empty.
+        given: fields of `SimulationConfig` that differ from its defaults.
+    """
+    from roel_service.simulate.dataset import SimulationConfig, simulate_dataset
+
+    return simulate_dataset(folder, SimulationConfig(**given), seed, progress)
+
+
 def serve(
     data: Path, host: str, port: int, *, insecure: bool, on_ready: Callable[[str], None]
 ) -> None:

@@ -32,7 +32,7 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
 
     folder = staged.get("out", staged["scratch"])
     room = folder / "room"
-    room.mkdir(parents=True)
+    folder.mkdir(exist_ok=True)
     with progress_bar() as progress:
         local.simulate(room, SEED, progress, seconds=SECONDS)
     recording = local.open_recording(

@@ -121,7 +121,7 @@ def integer(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
 
 
 def between(low: float, high: float) -> Callable[[str], float]:
-    """The value is a number strictly between two others."""
+    """The value is a number in a range, both ends included."""
 
     def parse(text: str) -> float:
         expected = f"a number between {low:g} and {high:g}"
@@ -129,7 +129,7 @@ def between(low: float, high: float) -> Callable[[str], float]:
             value = float(text)
         except ValueError:
             raise _mismatch(expected, text) from None
-        if not (math.isfinite(value) and low < value < high):
+        if not (math.isfinite(value) and low <= value <= high):
             raise _mismatch(expected, text)
         return value
 
