@@ -19,7 +19,7 @@ def ramp(change, threshold, refractory_us=0.0, reference=0.0, last_us=-np.inf):
         "reference": np.full((1, 1), reference),
         "last_us": np.full((1, 1), last_us),
     }
-    t_us, x, y, polarity = emit(
+    t_us, _, _, polarity = emit(
         np.full((1, 1), change),
         START_US,
         STOP_US,
