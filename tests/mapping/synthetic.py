@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.config.stages import FramesConfig, RefineConfig
+from roel_service.config.stages import FramesConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.mapping.evidence import measure_evidence
@@ -88,10 +88,11 @@ class World:
     def views(self):
         return views_of(self.observations, self.frames)
 
-    def evidence(self, refine=None):
-        refine = refine or RefineConfig()
+    def evidence(self, refine):
+        # Poses at every microsecond take a while; without events nothing looks at them.
+        frames_config = EXACT_FRAMES if refine.event_weight else FramesConfig()
         return measure_evidence(
-            self.observations, self.frames, self.trajectory, EXACT_FRAMES, refine
+            self.observations, self.frames, self.trajectory, frames_config, refine
         )
 
 
@@ -123,7 +124,7 @@ def observe(truth, poses, frames, noise_px=0.0, event_noise_px=0.0, event_count=
     ends_px = ends_px[frame_of, line_of]
     left = segments.left_normal(ends_px)
     # Nearest in time first, as the plane fit leaves them.
-    dt_us = rng.integers(-500, 501, (len(frame_of), event_count))
+    dt_us = rng.integers(-250, 251, (len(frame_of), event_count))
     dt_us = np.take_along_axis(dt_us, np.argsort(np.abs(dt_us), axis=1, kind="stable"), axis=1)
     share = rng.random((*dt_us.shape, 1))
     points = truth[line_of, None, 0] + share * (truth[line_of, None, 1] - truth[line_of, None, 0])
