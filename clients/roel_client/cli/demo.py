@@ -13,7 +13,7 @@ from roel_client.cli.staging import Staged
 from roel_service.config.load import load_config
 
 SEED = 7
-SECONDS = 3.0
+SECONDS = 2.5
 
 
 def add_commands(subparsers: Subparsers) -> None:
@@ -34,7 +34,7 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
     room = folder / "room"
     folder.mkdir(exist_ok=True)
     with progress_bar() as progress:
-        local.simulate(room, SEED, progress, seconds=SECONDS)
+        local.simulate(room, SEED, progress, seconds=SECONDS, panorama_count=0)
     recording = local.open_recording(
         str(room / "events.h5"), str(room / "poses.txt"), str(room / "camera.json"), None
     )
