@@ -26,6 +26,9 @@ from roel_service.scene.results import TrackStatus
 SPAN_COVERAGE_FRACTION = 0.25
 # Strength of a segment is n sqrt(length) / (this + sigma): below it, sigma does not matter.
 SIGMA_FLOOR_M = 0.01
+# Information that no observation gives, as a share of the whole: above float64's rounding, so that
+# what nothing tells is very uncertain, not certain.
+LEAST_INFORMATION = 1e-14
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -205,7 +208,8 @@ def _sigma_m(refined: Refined, pieces: _Segments) -> FloatArray:
     U, phi = plucker.orthonormal_from_plucker(direction, moment)
     dv, dm = plucker.plucker_jacobians(U, phi)
     by_foot = np.cross(dv, moment[..., None], axis=-2) + np.cross(direction[..., None], dm, axis=-2)
-    covariance = np.linalg.pinv(refined.information, hermitian=True)
+    whole = np.trace(refined.information, axis1=-2, axis2=-1)[:, None, None]
+    covariance = np.linalg.inv(refined.information + LEAST_INFORMATION * whole * np.eye(4))
     line = pieces.line
     about_origin = pieces.interval_m - dot(direction, refined.origin)[line, None]
     worst: FloatArray = np.zeros(len(line))
