@@ -98,14 +98,19 @@ class World:
 
 @functools.cache
 def world(scale=1.0, frame_count=24, noise_px=0.0, event_noise_px=0.0, lines=tuple(range(12))):
-    """The edges, seen in every frame in which they are wholly in the image.
+    """Those of `SEGMENTS_WORLD` that `lines` names, as `world_of`."""
+    truth = SEGMENTS_WORLD[list(lines)]
+    return world_of(truth, scale, frame_count, noise_px, event_noise_px)
+
+
+def world_of(segments_world, scale=1.0, frame_count=24, noise_px=0.0, event_noise_px=0.0):
+    """Edges, seen in every frame in which they are wholly in the image.
 
     Args:
         noise_px: standard deviation of the observed ends, across the segment.
         event_noise_px: of the supporting events.
-        lines: which of `SEGMENTS_WORLD` there are.
     """
-    truth = scale * SEGMENTS_WORLD[list(lines)]
+    truth = scale * np.asarray(segments_world)
     poses = trajectory(scale)
     t_us = np.linspace(20_000, DURATION_US - 20_000, frame_count).astype(np.int64)
     frames = frames_at(t_us, poses, CAMERA)
