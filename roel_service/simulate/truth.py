@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray
+from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3
 from roel_service.progress import StepCallback
@@ -24,6 +24,9 @@ CANNY_LOW, CANNY_HIGH = 30, 70
 CLOUD_NOISE_M = 0.005
 CLOUD_VOXEL_M = 0.02
 CLOUD_VIEW_PX = 320
+# A voxel's three indices in one integer: a million voxels to either side of the origin.
+KEY_BITS = 21
+KEY_OFFSET = 1 << (KEY_BITS - 1)
 
 
 def observable_edges(
@@ -54,9 +57,9 @@ def observable_edges(
     for view in range(len(T_world_camera)):
         progress(view, len(T_world_camera))
         points = _edge_points(scene, atlas, T_world_camera[view], zoomed, width, height)
-        seen.append(np.unique(_indices(points, voxel_m), axis=0))
-    voxels, counts = np.unique(np.concatenate(seen), axis=0, return_counts=True)
-    return np.asarray((voxels[counts >= MIN_VIEW_COUNT] + 0.5) * voxel_m, dtype=np.float32)
+        seen.append(np.unique(_voxel_keys(points, voxel_m)))
+    keys, counts = np.unique(np.concatenate(seen), return_counts=True)
+    return np.asarray(_voxel_middles(keys[counts >= MIN_VIEW_COUNT], voxel_m), dtype=np.float32)
 
 
 def _edge_points(
@@ -94,7 +97,7 @@ def surface_cloud(
             rows, columns = np.nonzero(np.isfinite(depth_m))
             points.append(_lifted(rows, columns, depth_m, K, T_world_camera))
     cloud = np.concatenate(points)
-    first = np.unique(_indices(cloud, CLOUD_VOXEL_M * scale), axis=0, return_index=True)[1]
+    first = np.unique(_voxel_keys(cloud, CLOUD_VOXEL_M * scale), return_index=True)[1]
     noise = rng.normal(scale=CLOUD_NOISE_M * scale, size=(len(first), 3))
     return np.asarray(cloud[np.sort(first)] + noise, dtype=np.float32)
 
@@ -108,5 +111,14 @@ def _lifted(
     return T_world_camera @ in_camera
 
 
-def _indices(points: FloatArray, voxel_m: float) -> Array:
-    return np.floor(points / voxel_m).astype(np.int64)
+def _voxel_keys(points: FloatArray, voxel_m: float) -> IntArray:
+    """(n,) one number for each point's voxel: rows of three would sort five times slower."""
+    x, y, z = (np.floor(points / voxel_m).astype(np.int64) + KEY_OFFSET).T
+    return np.asarray((x << 2 * KEY_BITS) | (y << KEY_BITS) | z)
+
+
+def _voxel_middles(keys: IntArray, voxel_m: float) -> FloatArray:
+    """(n, 3) m."""
+    indices = np.stack([keys >> 2 * KEY_BITS, keys >> KEY_BITS, keys], axis=-1)
+    indices &= (1 << KEY_BITS) - 1
+    return np.asarray((indices - KEY_OFFSET + 0.5) * voxel_m)
