@@ -17,6 +17,8 @@ from roel_service.geometry.vectors import angle_between, dot, norm, unit
 
 # Cosine of the angle beyond which two segments count as orthogonal: neither faces the other.
 ORTHOGONAL_COSINE = 1e-9
+# Share of a segment below which a facing part is a touch: the rounding of a common end.
+MIN_FACING_SHARE = 1e-9
 
 
 def span(segments: FloatArray) -> FloatArray:
@@ -122,7 +124,7 @@ def facing_part(segments_1: FloatArray, segments_2: FloatArray) -> FloatArray:
     fraction = dot(gap, direction_1[..., None, :]) / np.where(aligned, advance, np.nan)[..., None]
     fraction = np.clip(fraction, 0.0, 1.0)
     part = segments_2[..., None, 0, :] + fraction[..., None] * start_to_end[..., None, :]
-    empty = fraction[..., 0] == fraction[..., 1]
+    empty = np.abs(fraction[..., 1] - fraction[..., 0]) <= MIN_FACING_SHARE
     return np.where(empty[..., None, None], np.nan, part)
 
 

@@ -102,6 +102,7 @@ def test_inner_segment_distance_does_not_grow_with_the_longer_segment():
         CROSSING,  # orthogonal
         LONG + np.array([20.0, 0.0]),  # disjoint
         LONG + np.array([10.0, 0.0]),  # touching
+        LONG + np.array([10.0 - 1e-12, 2.0]),  # touching but for rounding
     ],
 )
 def test_nothing_faces_is_infinitely_far(other):
