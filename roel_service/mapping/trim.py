@@ -250,8 +250,8 @@ def _line_map(
 ) -> LineMap:
     """The good pieces, strongest first, without what lies along a stronger one."""
     ends = _ends(refined, pieces)
-    strength: FloatArray = pieces.frame_count * np.sqrt(norm(ends[:, 1] - ends[:, 0]))
-    strength = strength / (SIGMA_FLOOR_M + sigma_m)
+    root_length = np.sqrt(norm(ends[:, 1] - ends[:, 0]))
+    strength = pieces.frame_count.astype(np.float64) * root_length / (SIGMA_FLOOR_M + sigma_m)
     order = np.argsort(-strength, kind="stable")
     order = order[good[order]]
     segments, source = _without_overlaps(ends[order], config)
