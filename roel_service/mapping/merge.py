@@ -29,6 +29,8 @@ def merge_duplicates(
     With a minimum cluster size of one, DBSCAN's clusters are the connected components of the graph
     of neighbours.
     """
+    if len(refined) == 0:
+        return refined, []
     spans_m = covered_spans(refined.lines, refined.tracks, views)
     length_m = np.nan_to_num(spans_m[:, 1] - spans_m[:, 0])
     neighbours = _neighbours(refined, spans_m, views, frames, config)

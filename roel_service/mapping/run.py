@@ -70,6 +70,8 @@ class CountedEvents:
         first_us, last_us = self._range_us
         covered_us = np.clip(self._covered_us, first_us, last_us)
         share = float(np.diff(covered_us).sum()) / max(1, last_us - first_us)
+        if first_us == last_us:
+            share = float(self.covered_count > 0)
         if share < MIN_COVERED_SHARE:
             poses_us = self._covered_us[0, 0], self._covered_us[-1, 1]
             raise TrajectoryError(
@@ -95,6 +97,7 @@ class MappingRun:
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(MAPPING_STAGES, 0.0))
     statuses: Counter[TrackStatus] = field(default_factory=Counter)
     _stage: str = "detect"
+    _fraction: float = 0.0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -127,11 +130,13 @@ class MappingRun:
         begin = STAGE_BEGINS[self._stage]
         end = min((b for b in STAGE_BEGINS.values() if b > begin), default=1.0)
         share = done_count / total_count if total_count else 0.0
+        # Where stages change places (`match_global`), the fraction waits.
+        self._fraction = max(self._fraction, begin + share * (end - begin))
         self.progress(
             Progress(
                 stage=self._stage,
                 done_count=done_count,
                 total_count=total_count,
-                fraction=begin + share * (end - begin),
+                fraction=self._fraction,
             )
         )
