@@ -25,7 +25,7 @@ from roel_service.scene.events import EventStream, concatenate
 from roel_service.simulate.meshes import scene_from_mesh
 from roel_service.simulate.motion import Motion, as_odometry, walk_around, walk_in_room
 from roel_service.simulate.panoramas import render_panorama
-from roel_service.simulate.render import render, render_depth
+from roel_service.simulate.render import THREAD_COUNT, render, render_depth
 from roel_service.simulate.rooms import furnished_room, grid_cube
 from roel_service.simulate.scenes import Scene, texture_atlas
 from roel_service.simulate.sensor import EventSensor, SensorModel
@@ -56,7 +56,6 @@ JPEG_QUALITY = 92
 # Events are handed on in pieces of at least this many.
 PIECE_EVENT_COUNT = 500_000
 STAGES = ("events", "edges", "cloud", "panoramas")
-THREAD_COUNT = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,10 +215,8 @@ class _Recording:
     def _grey_picture(self, t_us: int) -> Array:
         camera = self.config.camera
         T_world_camera = self.motion.poses(np.array([t_us]))[0]
-        picture = render(
-            self.scene, self.grey, T_world_camera, camera.matrix, camera.width, camera.height
-        )
-        return picture.colour[..., 0]
+        size = (camera.width, camera.height)
+        return render(self.scene, self.grey, T_world_camera, camera.matrix, *size)[..., 0]
 
     def _write_truth(self, folder: Path, camera: Camera) -> None:
         t_us = np.arange(0, self.duration_us + 1, EDGE_INTERVAL_US)
@@ -259,21 +256,32 @@ class _Recording:
     def _write_panoramas(self, folder: Path) -> None:
         (folder / "panos").mkdir()
         atlas = texture_atlas(self.scene.textures, grey=False)
-        rng = self.rng["panoramas"]
-        count = self.config.panorama_count
+        width = self.config.panorama_width
+
+        def picture(pose: SE3) -> Array:
+            return render_panorama(self.scene, atlas, pose, width)
+
+        poses = self._panorama_poses()
         lines = ["# index tx ty tz qx qy qz qw  (T_world_panorama)"]
-        for index, place in enumerate(self._places(count, rng)):
-            self._tell("panoramas", index, count)
+        pictures = in_order(picture, poses, THREAD_COUNT)
+        for index, (pose, panorama) in enumerate(zip(poses, pictures, strict=True)):
+            self._tell("panoramas", index, len(poses))
+            _write_jpeg(folder / "panos" / f"{index:03d}.jpg", panorama)
+            numbers = [*pose.translation, *pose.quaternion_xyzw()]
+            lines.append(" ".join([str(index), *(f"{number:.9f}" for number in numbers)]))
+        (folder / "panos" / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+    def _panorama_poses(self) -> list[SE3]:
+        """`T_world_panorama` of each panorama: any heading, every fourth one tilted."""
+        rng = self.rng["panoramas"]
+        poses = []
+        for index, place in enumerate(self._places(self.config.panorama_count, rng)):
             tilt_rad = rng.uniform(-1, 1, size=2) * MAX_TILT_RAD / np.sqrt(2)
             turn = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
             if index % 4 == 3:
                 turn = turn @ rotation_from_vector(np.append(tilt_rad, 0.0))
-            pose = SE3(rotation=turn, translation=place)
-            picture = render_panorama(self.scene, atlas, pose, self.config.panorama_width)
-            _write_jpeg(folder / "panos" / f"{index:03d}.jpg", picture)
-            numbers = [*pose.translation, *pose.quaternion_xyzw()]
-            lines.append(" ".join([str(index), *(f"{number:.9f}" for number in numbers)]))
-        (folder / "panos" / "poses.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+            poses.append(SE3(rotation=turn, translation=place))
+        return poses
 
 
 class _Counter:

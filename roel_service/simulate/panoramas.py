@@ -46,7 +46,7 @@ def render_panorama(scene: Scene, atlas: TextureAtlas, T_world_panorama: SE3, wi
     facing = np.argmax(rays @ FACE_ROTATIONS[:, :, 2].T, axis=-1)
     for face, R_panorama_camera in enumerate(FACE_ROTATIONS):
         T_panorama_camera = SE3(rotation=R_panorama_camera, translation=np.zeros(3))
-        view = render(scene, atlas, T_world_panorama @ T_panorama_camera, K, size, size).colour
+        view = render(scene, atlas, T_world_panorama @ T_panorama_camera, K, size, size)
         mask = facing == face
         x, y, z = (rays[mask] @ R_panorama_camera).T
         place = np.stack([focal_px * x / z + K[0, 2], focal_px * y / z + K[1, 2]], axis=-1)

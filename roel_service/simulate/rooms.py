@@ -21,8 +21,11 @@ BOX_FACES = np.array(
     ],
     dtype=np.float64,
 )
-# Furniture keeps this far from the path of the camera, m.
-FREE_RADIUS_M = 1.25
+# Loose boxes stand this far from the middle of the room, m, and outside the camera's path.
+LOOSE_RADIUS_M = (1.2, 2.2)
+LOOSE_TRIAL_COUNT = 20
+# Boxes up to this height, m, can be stood upon: rugs.
+FLAT_M = 0.02
 
 
 class SceneBuilder:
@@ -33,6 +36,7 @@ class SceneBuilder:
         self._repeats: list[tuple[float, float]] = []
         self._texture: list[int] = []
         self._textures: list[Array] = []
+        self._footprints: list[FloatArray] = []
 
     def texture(self, image: Array) -> int:
         """Add a texture; the number serves any count of surfaces."""
@@ -66,9 +70,18 @@ class SceneBuilder:
         """
         cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
         turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        if size[2] > FLAT_M:
+            ground = np.asarray(centre) + (BOX_FACES[5] * np.asarray(size) / 2) @ turn.T
+            self._footprints.append(np.stack([ground.min(axis=0), ground.max(axis=0)])[:, :2])
         for face, corners in enumerate(BOX_FACES):
             placed = np.asarray(centre) + (corners * np.asarray(size) / 2) @ turn.T
             self.quad(placed, front if front is not None and face == 3 else texture)
+
+    def is_free(self, place: FloatArray, radius_m: float) -> bool:
+        """Whether no box but flat ones, at any height, reaches into a circle about (2,) `place`."""
+        low, high = np.array(self._footprints).transpose(1, 0, 2)
+        outside = np.maximum(low - place, place - high).clip(0.0)
+        return bool(np.linalg.norm(outside, axis=1).min() > radius_m)
 
     def scene(self) -> Scene:
         """Everything so far, two triangles for each rectangle."""
@@ -103,15 +116,17 @@ def furnished_room(rng: np.random.Generator) -> Scene:
     _shell(build, size, rng)
     walls = [_Wall(side, size) for side in range(4)]
     order = rng.permutation(4)
-    _door(build, walls[order[0]], rng)
+    # What stands in a corner stands at this end of its wall, so that no two share a corner.
+    hand = rng.choice([-1.0, 1.0])
+    _door(build, walls[order[0]], -hand, rng)
     _window(build, walls[order[1]], rng)
     _window(build, walls[order[2]], rng)
     for wall in walls:
         _pictures(build, wall, rng)
-    _shelf(build, walls[order[3]], rng)
-    _cabinet(build, walls[order[1]], rng)
-    _sofa(build, walls[order[2]], rng)
-    _desk(build, walls[order[0]], rng)
+    _shelf(build, walls[order[3]], hand, rng)
+    _cabinet(build, walls[order[1]], hand, rng)
+    _sofa(build, walls[order[2]], hand, rng)
+    _desk(build, walls[order[0]], hand, rng)
     _loose_boxes(build, size, rng)
     return build.scene()
 
@@ -148,7 +163,7 @@ class _Wall:
 
 
 def _shell(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> None:
-    """Floor, ceiling and walls, seen from inside, with skirting boards and a rug."""
+    """Floor, ceiling with lamps, walls with boards below and above, a rug."""
     floor = textures.planks(14, rng) if rng.random() < 0.6 else textures.tiles(8, rng)
     wall_colour = rng.uniform(0.55, 0.8) * np.array([1.0, 0.98, 0.94])
     wall = build.texture(textures.mottled(wall_colour, 0.02, 128, rng))
@@ -159,17 +174,29 @@ def _shell(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> N
     build.quad(faces[4], ceiling)
     build.quad(faces[5], build.texture(floor), (2.0, 2.0))
     board = build.texture(textures.plain(rng.uniform(0.15, 0.35) * np.array([1.0, 0.9, 0.8])))
+    cornice = build.texture(textures.plain(np.full(3, 0.95)))
     for side in range(4):
         edge = _Wall(side, size)
         edge.box(build, (0.0, 0.05, 0.0), (edge.width_m, 0.015, 0.1), board)
+        edge.box(build, (0.0, size[2] - 0.04, 0.0), (edge.width_m, 0.05, 0.08), cornice)
+    for share in (0.3, 0.7):
+        _lamp(build, np.array([0.5, share, 1.0]) * size)
     rug = build.texture(textures.stripes(int(rng.integers(6, 11)), rng))
     centre = np.array([size[0] / 2, size[1] / 2, 0.006])
     reach = np.array([rng.uniform(1.2, 2.0), rng.uniform(0.9, 1.5), 0.012])
     build.box(centre, reach, rug, yaw_rad=rng.uniform(-0.4, 0.4))
 
 
-def _door(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
-    along = rng.uniform(-0.25, 0.25) * wall.width_m
+def _lamp(build: SceneBuilder, place: FloatArray) -> None:
+    """A bright panel in a dark frame under the ceiling, at (3,) m."""
+    frame = build.texture(textures.plain(np.full(3, 0.3)))
+    light = build.texture(textures.plain(np.ones(3)))
+    build.box(place - [0.0, 0.0, 0.025], np.array([1.1, 0.35, 0.05]), frame)
+    build.box(place - [0.0, 0.0, 0.03], np.array([1.0, 0.25, 0.05]), light)
+
+
+def _door(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+    along = hand * rng.uniform(0.1, 0.25) * wall.width_m
     frame = build.texture(textures.plain(rng.uniform(0.75, 0.9) * np.ones(3)))
     leaf = rng.uniform(0.2, 0.5) * np.array([1.0, 0.75, 0.5])
     front = build.texture(textures.panels(2, 1, leaf))
@@ -198,10 +225,10 @@ def _pictures(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> Non
             wall.box(build, place, (width, 0.03, height), rim, picture)
 
 
-def _shelf(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _shelf(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
     """A bookshelf with boards and books."""
     width, depth, height = rng.uniform(0.9, 1.4), 0.28, rng.uniform(1.6, 2.0)
-    along = rng.uniform(-0.3, 0.3) * (wall.width_m - width)
+    along = hand * rng.uniform(0.0, 0.3) * (wall.width_m - width)
     wood = build.texture(textures.plain(rng.uniform(0.3, 0.7) * np.array([1.0, 0.8, 0.55])))
     for side in (-1, 1):
         place = (along + side * (width / 2 - 0.01), height / 2, 0.0)
@@ -221,9 +248,9 @@ def _shelf(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
             position += thick
 
 
-def _cabinet(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _cabinet(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
     width, depth, height = rng.uniform(0.8, 1.4), 0.45, rng.uniform(0.6, 0.85)
-    along = rng.choice([-1, 1]) * (wall.width_m - width) * 0.4
+    along = hand * (wall.width_m - width) * 0.4
     colour = rng.uniform(0.3, 0.75) * np.array([1.0, 0.95, 0.85])
     front = build.texture(textures.panels(int(rng.integers(2, 4)), int(rng.integers(2, 4)), colour))
     side = build.texture(textures.plain(0.8 * colour))
@@ -233,9 +260,9 @@ def _cabinet(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None
     wall.box(build, (along, height + 0.27, 0.15), (0.75, 0.05, 0.44), screen, shown)
 
 
-def _sofa(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _sofa(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
     width = rng.uniform(1.3, 1.8)
-    along = rng.uniform(-0.2, 0.2) * (wall.width_m - width)
+    along = hand * rng.uniform(0.0, 0.2) * (wall.width_m - width)
     cloth = build.texture(textures.mottled(rng.uniform(0.15, 0.5, 3), 0.08, 128, rng))
     wall.box(build, (along, 0.2, 0.1), (width, 0.75, 0.4), cloth)
     wall.box(build, (along, 0.55, 0.1), (width, 0.2, 0.5), cloth)
@@ -245,10 +272,10 @@ def _sofa(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
     wall.box(build, (along + rng.uniform(-0.4, 0.4), 0.58, 0.32), (0.4, 0.12, 0.36), cushion)
 
 
-def _desk(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _desk(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
     """A desk with legs, a lamp, a monitor and a chair beside it."""
     width, depth, height = rng.uniform(1.0, 1.4), 0.6, 0.74
-    along = rng.choice([-1, 1]) * (wall.width_m / 2 - width / 2 - 0.1)
+    along = hand * (wall.width_m / 2 - width / 2 - 0.1)
     wood = build.texture(textures.plain(rng.uniform(0.35, 0.8) * np.array([1.0, 0.85, 0.65])))
     metal = build.texture(textures.plain(np.full(3, rng.uniform(0.05, 0.2))))
     wall.box(build, (along, height, 0.05), (width, depth, 0.03), wood)
@@ -269,16 +296,18 @@ def _desk(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
 
 
 def _loose_boxes(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> None:
-    """Boxes on the floor, outside the circle that the camera walks."""
-    for _ in range(int(rng.integers(4, 8))):
+    """Boxes on the floor where nothing else stands, outside the circle that the camera walks."""
+    for _ in range(LOOSE_TRIAL_COUNT):
         box = rng.uniform([0.2, 0.2, 0.15], [0.5, 0.45, 0.5])
-        angle = rng.uniform(0, 2 * np.pi)
-        reach = FREE_RADIUS_M + 0.35
-        offset = np.array([np.cos(angle), np.sin(angle)]) * reach
-        limit = size[:2] / 2 - 0.4
-        centre = np.append(size[:2] / 2 + np.clip(offset, -limit, limit), box[2] / 2)
+        angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(*LOOSE_RADIUS_M)
+        place = size[:2] / 2 + reach * np.array([np.cos(angle), np.sin(angle)])
+        radius_m = float(np.hypot(box[0], box[1])) / 2
+        is_inside = (place > radius_m).all() and (place < size[:2] - radius_m).all()
+        if not is_inside or not build.is_free(place, radius_m):
+            continue
         side = build.texture(textures.plain(rng.uniform(0.1, 0.7, 3)))
         front = build.texture(textures.stripes(int(rng.integers(3, 6)), rng))
+        centre = np.append(place, box[2] / 2)
         build.box(centre, box, side, yaw_rad=rng.uniform(0, np.pi), front=front)
 
 

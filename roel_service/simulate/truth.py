@@ -8,9 +8,10 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3
+from roel_service.in_order import in_order
 from roel_service.progress import StepCallback
 from roel_service.simulate.panoramas import FACE_ROTATIONS
-from roel_service.simulate.render import render, render_depth
+from roel_service.simulate.render import THREAD_COUNT, render, render_depth
 from roel_service.simulate.scenes import Scene, TextureAtlas
 
 # Voxels of edge points, and how many views must agree on one.
@@ -53,11 +54,16 @@ def observable_edges(
     # Pixel centres are at integers: the corner of the image, at -1/2, is what stays in place.
     zoomed[:2, 2] += 0.5 * (EDGE_ZOOM - 1)
     zoomed[2, 2] = 1.0
-    seen = []
-    for view in range(len(T_world_camera)):
-        progress(view, len(T_world_camera))
+
+    def keys_of_view(view: int) -> IntArray:
         points = _edge_points(scene, atlas, T_world_camera[view], zoomed, width, height)
-        seen.append(np.unique(_voxel_keys(points, voxel_m)))
+        return np.unique(_voxel_keys(points, voxel_m))
+
+    view_count = len(T_world_camera)
+    seen: list[IntArray] = []
+    for keys in in_order(keys_of_view, range(view_count), THREAD_COUNT):
+        progress(len(seen), view_count)
+        seen.append(keys)
     keys, counts = np.unique(np.concatenate(seen), return_counts=True)
     return np.asarray(_voxel_middles(keys[counts >= MIN_VIEW_COUNT], voxel_m), dtype=np.float32)
 
@@ -66,10 +72,12 @@ def _edge_points(
     scene: Scene, atlas: TextureAtlas, T_world_camera: SE3, K: FloatArray, width: int, height: int
 ) -> FloatArray:
     """(n, 3) m, world, of the Canny edges of one view."""
-    picture = render(scene, atlas, T_world_camera, K, width * EDGE_ZOOM, height * EDGE_ZOOM)
-    grey = np.rint(255.0 * picture.colour[..., 0].clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    size = (width * EDGE_ZOOM, height * EDGE_ZOOM)
+    picture = render(scene, atlas, T_world_camera, K, *size)[..., 0]
+    grey = np.rint(255.0 * picture.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
+    depth_m = render_depth(scene, T_world_camera, K, *size)
     # An edge belongs to the nearer of the surfaces that meet in it.
-    nearest_m = np.asarray(cv2.erode(picture.depth_m, np.ones((3, 3))), dtype=np.float64)
+    nearest_m = np.asarray(cv2.erode(depth_m, np.ones((3, 3))), dtype=np.float64)
     rows, columns = np.nonzero(cv2.Canny(grey, CANNY_LOW, CANNY_HIGH))
     hit = np.isfinite(nearest_m[rows, columns])
     return _lifted(rows[hit], columns[hit], nearest_m, K, T_world_camera)
@@ -86,20 +94,29 @@ def surface_cloud(
         scale: of noise and voxels, in units of a room.
         rng: draws the noise.
     """
+    voxel_m = CLOUD_VOXEL_M * scale
+
+    def points_seen_from(place: FloatArray) -> FloatArray:
+        return _first_of_voxels(_surface_points(scene, place), voxel_m)
+
+    seen = in_order(points_seen_from, places, THREAD_COUNT)
+    cloud = _first_of_voxels(np.concatenate(list(seen)), voxel_m)
+    noise = rng.normal(scale=CLOUD_NOISE_M * scale, size=cloud.shape)
+    return np.asarray(cloud + noise, dtype=np.float32)
+
+
+def _surface_points(scene: Scene, place: FloatArray) -> FloatArray:
+    """(n, 3) m: what can be seen from a place, in all directions."""
     middle = (CLOUD_VIEW_PX - 1) / 2
     half = CLOUD_VIEW_PX / 2
     K = np.array([[half, 0, middle], [0, half, middle], [0, 0, 1.0]])
     points = []
-    for place in places:
-        for R_world_camera in FACE_ROTATIONS:
-            T_world_camera = SE3(rotation=R_world_camera, translation=place)
-            depth_m = render_depth(scene, T_world_camera, K, CLOUD_VIEW_PX, CLOUD_VIEW_PX)
-            rows, columns = np.nonzero(np.isfinite(depth_m))
-            points.append(_lifted(rows, columns, depth_m, K, T_world_camera))
-    cloud = np.concatenate(points)
-    first = np.unique(_voxel_keys(cloud, CLOUD_VOXEL_M * scale), return_index=True)[1]
-    noise = rng.normal(scale=CLOUD_NOISE_M * scale, size=(len(first), 3))
-    return np.asarray(cloud[np.sort(first)] + noise, dtype=np.float32)
+    for R_world_camera in FACE_ROTATIONS:
+        T_world_camera = SE3(rotation=R_world_camera, translation=place)
+        depth_m = render_depth(scene, T_world_camera, K, CLOUD_VIEW_PX, CLOUD_VIEW_PX)
+        rows, columns = np.nonzero(np.isfinite(depth_m))
+        points.append(_lifted(rows, columns, depth_m, K, T_world_camera))
+    return np.concatenate(points)
 
 
 def _lifted(
@@ -109,6 +126,12 @@ def _lifted(
     xy = projection.normalized_from_pixel(np.stack([columns, rows], axis=-1), K)
     in_camera = np.column_stack([xy, np.ones(len(xy))]) * depth_m[rows, columns, None]
     return T_world_camera @ in_camera
+
+
+def _first_of_voxels(points: FloatArray, voxel_m: float) -> FloatArray:
+    """(m, 3) the first point of each voxel, in order."""
+    first = np.unique(_voxel_keys(points, voxel_m), return_index=True)[1]
+    return points[np.sort(first)]
 
 
 def _voxel_keys(points: FloatArray, voxel_m: float) -> IntArray:

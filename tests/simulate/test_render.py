@@ -11,7 +11,7 @@ from .samples import BRIGHT, DARK, DEPTH_M, FOCAL_PX, HEIGHT, WIDTH, K, at, unli
 
 def picture(scene: Scene, x_m: float = 0.0, y_m: float = 0.0) -> np.ndarray:
     atlas = texture_atlas(scene.textures, grey=True)
-    return render(scene, atlas, at(x_m, y_m, 0.0), K, WIDTH, HEIGHT).colour[..., 0]
+    return render(scene, atlas, at(x_m, y_m, 0.0), K, WIDTH, HEIGHT)[..., 0]
 
 
 def rectangle(build: SceneBuilder, depth_m: float, half_m: float, grey: float) -> None:

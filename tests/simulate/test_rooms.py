@@ -63,7 +63,7 @@ def test_every_view_of_the_walk_has_contrast_to_see(room):
     motion = walk_in_room(room.bounds_m, np.random.default_rng(0))
     poses = motion.poses(np.arange(0, 7_000_000, 1_000_000))
     for i in range(len(poses)):
-        log_grey = np.log(render(room, atlas, poses[i], K, SIZE, SIZE).colour[..., 0])
+        log_grey = np.log(render(room, atlas, poses[i], K, SIZE, SIZE)[..., 0])
         edges = np.abs(np.diff(log_grey, axis=1)) > 0.2
         assert edges.sum() > SIZE
 
@@ -93,7 +93,7 @@ def test_each_face_of_the_cube_shows_two_by_two_cells():
         view_K = np.array(
             [[focal_px, 0, (size - 1) / 2], [0, focal_px, (size - 1) / 2], [0, 0, 1.0]]
         )
-        grey = render(cube, atlas, pose, view_K, size, size).colour[..., 0]
+        grey = render(cube, atlas, pose, view_K, size, size)[..., 0]
         for line in (grey[size // 4], grey[:, size // 4]):
             dark = line < 0.5 * line.max()
             runs = np.flatnonzero(np.diff(np.concatenate([[False], dark, [False]]).astype(int)) > 0)

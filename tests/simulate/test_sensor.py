@@ -90,7 +90,7 @@ def mean_distance_px(normal: np.ndarray, speed_px_s: float) -> float:
 
     def picture(t_us):
         pose = at(*(moved_m(t_us) * normal), 0.0)
-        return render(scene, atlas, pose, K, WIDTH, HEIGHT).colour[..., 0]
+        return render(scene, atlas, pose, K, WIDTH, HEIGHT)[..., 0]
 
     sensor = EventSensor(QUIET, picture(0), np.random.default_rng(0))
     times_us = range(2_000, duration_us + 1, 2_000)
