@@ -48,21 +48,26 @@ EXACT_SLOT_US = 1
 EXACT_FRAMES = FramesConfig(slot_us=EXACT_SLOT_US)
 
 
-def path(t_us, scale=1.0):
-    """Poses on a loop some 0.5 m wide, looking at the origin with a slow turn of the head."""
+def path(t_us, scale=1.0, radius=1.0):
+    """Poses on a loop some 0.5 m wide, looking at the origin with a slow turn of the head.
+
+    Args:
+        radius: share of the loop's width; 0 leaves a camera that only turns.
+    """
     phase = 2 * np.pi * np.asarray(t_us) / DURATION_US
     centre = np.stack(
-        [0.30 * np.sin(phase), 0.22 * np.cos(phase), -2.0 + 0.10 * np.sin(2 * phase)], axis=-1
+        [0.30 * np.sin(phase), 0.22 * np.cos(phase), 0.10 * np.sin(2 * phase)], axis=-1
     )
+    centre = radius * centre + np.array([0.0, 0.0, -2.0])
     turn = np.stack(
         [0.05 * np.sin(phase + 1.0), 0.06 * np.cos(phase), 0.10 * np.sin(phase)], axis=-1
     )
     return SE3(rotation=rotation_from_vector(turn), translation=scale * centre)
 
 
-def trajectory(scale=1.0, first_us=0, last_us=DURATION_US):
+def trajectory(scale=1.0, first_us=0, last_us=DURATION_US, radius=1.0):
     t_us = np.arange(first_us, last_us + 1, POSE_STEP_US)
-    return Trajectory(t_us=t_us, T_world_camera=path(t_us, scale))
+    return Trajectory(t_us=t_us, T_world_camera=path(t_us, scale, radius))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,16 +260,17 @@ def event_frame_of(*parts, width=CAMERA.width, height=CAMERA.height, t_ref_us=0)
     )
 
 
-def event_stream(segments_world=SEGMENTS_WORLD, scale=1.0, last_us=DURATION_US, seed=0):
-    """Rounded events at random times along the moving edges, about two a px and 10 ms."""
-    rng = np.random.default_rng(seed)
-    poses = trajectory(scale)
+@functools.cache
+def event_stream(scale=1.0, last_us=DURATION_US, radius=1.0):
+    """Rounded events at random times along the moving edges, about one a px and 10 ms."""
+    rng = np.random.default_rng(0)
+    poses = trajectory(scale, radius=radius)
     columns = []
-    for line, segment in enumerate(scale * np.asarray(segments_world)):
+    for line, segment in enumerate(scale * SEGMENTS_WORLD):
         length_px = np.linalg.norm(
             np.diff(points_at(segment, [0.0, 1.0], np.array([0, 0]), poses), axis=0)
         )
-        count = int(length_px * 2 * last_us / 10_000)
+        count = int(length_px * last_us / 10_000)
         t_us = rng.integers(0, last_us + 1, count)
         xy = np.rint(points_at(segment, rng.random(count), t_us, poses))
         inside = ((xy >= 0) & (xy < [CAMERA.width, CAMERA.height])).all(axis=1)
