@@ -69,7 +69,8 @@ class Stage:
         for item in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
             value = getattr(self, item.name)
             rule = item.metadata.get("rule")
-            finite = not isinstance(value, float) or math.isfinite(value)
+            numbers = value if isinstance(value, tuple) else (value,)
+            finite = all(math.isfinite(x) for x in numbers if isinstance(x, float))
             if rule is not None and not (finite and rule.holds(value)):
                 path = f"{self.table}.{item.name}"
                 raise ConfigError(path, rule.expected, repr(value))
@@ -93,6 +94,12 @@ class FramesConfig(Stage, table="frames"):
     slot_us: int = parameter(500, POSITIVE)
     min_half_window_us: int = parameter(6_000, POSITIVE)
     max_half_window_us: int = parameter(25_000, POSITIVE)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.min_half_window_us > self.max_half_window_us:
+            expected = f"<= max_half_window_us = {self.max_half_window_us}"
+            raise ConfigError("frames.min_half_window_us", expected, f"{self.min_half_window_us}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +181,8 @@ class MatchLocalConfig(Stage, table="match_local"):
         predict: move a line by its speed and the camera's rotation before comparing.
         max_distance_px: largest distance between the lines.
         min_overlap: share of the shorter line that must face the other.
-        reach_frame_count: a track stays open for this many frames without a line.
+        reach_frame_count: how many frames ago a track may have been seen last; 1 links
+            neighbouring frames alone.
     """
 
     predict: bool = True
@@ -295,7 +303,7 @@ class TrimConfig(Stage, table="trim"):
 
     method: str = parameter("coverage", one_of(TRIM_METHODS))
     max_gap_m: float = parameter(0.03, NOT_NEGATIVE)
-    min_length_m: float = parameter(0.03, NOT_NEGATIVE)
+    min_length_m: float = parameter(0.03, POSITIVE)
     min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)
     min_coverage_count: int = parameter(4, POSITIVE)
     min_coverage_fraction: float = parameter(0.25, SHARE)
