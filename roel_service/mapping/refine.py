@@ -151,10 +151,10 @@ class _Problem:
         ends = end_residuals_px(local, v[self.line], m[self.line], self.focal_px)
         return np.asarray(np.abs(ends).max(axis=-1))
 
-    def inliers(self, residual_px: FloatArray, iteration: int) -> BoolArray:
+    def inliers(self, residual_px: FloatArray, *, loose: bool) -> BoolArray:
         """(S,) observations within the gate, which is wider in the first steps."""
-        loose = FIRST_GATE if iteration < LOOSE_ITERATION_COUNT else 1.0
-        return np.asarray(residual_px < loose * self.config.max_residual_px)
+        widening = FIRST_GATE if loose else 1.0
+        return np.asarray(residual_px < widening * self.config.max_residual_px)
 
     def robust_weight(self, residual_px: FloatArray) -> FloatArray:
         """(S,) weights of iterated reweighting."""
@@ -241,10 +241,11 @@ def refine_lines(
     weight = np.zeros(len(problem.line))
     for iteration in range(config.iteration_count):
         residual_px = problem.residual_px(state)
-        weight = problem.robust_weight(residual_px) * problem.inliers(residual_px, iteration)
+        inlier = problem.inliers(residual_px, loose=iteration < LOOSE_ITERATION_COUNT)
+        weight = problem.robust_weight(residual_px) * inlier
         state, damping = _step(problem, state, weight, damping)
     residual_px = problem.residual_px(state)
-    inlier = problem.inliers(residual_px, config.iteration_count)
+    inlier = problem.inliers(residual_px, loose=False)
     system = problem.system(state, problem.robust_weight(residual_px) * inlier)
     return _refined(problem, tracks, state, residual_px, inlier, system)
 
