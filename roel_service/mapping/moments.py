@@ -17,8 +17,8 @@ from roel_service.mapping.frames import Frames
 from roel_service.scene.lines import LineObservations
 from roel_service.scene.trajectory import Trajectory
 
-# Positions and weights of the rays that stand for a segment: their form has the first two moments
-# of a uniform distribution along it (three-point Gauss-Legendre, to two digits).
+# Positions and weights of the rays that stand for a segment: a third each at its middle and near
+# its ends, which count a little more than in a uniform distribution along it.
 SEGMENT_POSITIONS = np.array([0.11, 0.5, 0.89])
 SEGMENT_WEIGHTS = np.full(3, 1.0 / 3.0)
 
