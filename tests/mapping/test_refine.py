@@ -219,6 +219,19 @@ class TestNoise:
         # Those that were moved along their line are no outliers.
         assert kept[wrong].mean() < 0.3
 
+    @pytest.mark.parametrize("iteration_count", [1, 2, 8])
+    def test_the_gate_of_the_result_is_the_configured_one(self, iteration_count):
+        exact = world()
+        lines = exact.observations.segments_px.copy()
+        # Between the gate of the first steps, 3 px, and that of the result, 2 px.
+        lines[7] += 2.6 * segments.left_normal(lines[7])
+        observations = dataclasses.replace(exact.observations, segments_px=lines)
+        spoilt = dataclasses.replace(exact, observations=observations)
+        config = dataclasses.replace(PIXEL, iteration_count=iteration_count, event_weight=0.0)
+        found = refined(spoilt, config=config)
+        assert 7 not in found.tracks.observation
+        assert len(found.tracks.observation) == len(lines) - 1
+
     def test_long_observations_weigh_more_up_to_the_cap(self):
         noisy = world(noise_px=0.3)
         moments = [
