@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from roel_service.arrays import FloatArray
-from roel_service.geometry.vectors import angle_between, dot, norm, unit
+from roel_service.geometry.vectors import angle_between, norm
 
 # Sine of the angle to equal or opposite rays below which no great circle is defined by them.
 MIN_CIRCLE_SINE = 1e-12
@@ -78,11 +78,11 @@ def sample_arc(rays_1: FloatArray, rays_2: FloatArray, count: int) -> FloatArray
         (*B, count, 3) unit rays; copies for equal rays, NaN for opposite ones.
     """
     angle_rad = angle_between(rays_1, rays_2)[..., None]
-    # Towards ray 2, normal to ray 1.
-    side = rays_2 - dot(rays_1, rays_2)[..., None] * rays_1
-    undefined = (norm(side) < MIN_CIRCLE_SINE)[..., None]
-    side = np.where(undefined, np.nan, unit(side))
-    side = np.where(undefined & (angle_rad < 1.0), 0.0, side)  # equal rays: no arc to follow
+    # Normal to ray 1, towards ray 2; by the circle, as a difference of rays would lose its digits
+    # near opposite rays.
+    side = np.cross(great_circle_normal(rays_1, rays_2), rays_1)
+    equal = np.isnan(side) & (angle_rad < 1.0)
+    side = np.where(equal, 0.0, side)  # no arc to follow
     turn_rad = (np.linspace(0.0, 1.0, count) * angle_rad)[..., None]
     return np.asarray(
         np.cos(turn_rad) * rays_1[..., None, :] + np.sin(turn_rad) * side[..., None, :],

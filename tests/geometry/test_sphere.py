@@ -144,7 +144,7 @@ def test_arc_is_sampled_at_equal_angles_on_its_circle(ray_1, ray_2, count):
     arc = sample_arc(ray_1, ray_2, count)
     assert arc.shape == (count, 3)
     np.testing.assert_allclose(np.linalg.norm(arc, axis=-1), 1.0, rtol=1e-14)
-    # The direction of the arc is a difference of rays, rounded at 1e-16 over its length, 1e-6.
+    # The circle is known to the rounding of the rays, 1e-16, over the sine of their angle, 1e-6.
     np.testing.assert_allclose(arc[[0, -1]], [ray_1, ray_2], rtol=0, atol=1e-9)
     step_rad = angle_between(ray_1, ray_2) / (count - 1)
     np.testing.assert_allclose(angle_between(arc[:-1], arc[1:]), step_rad, rtol=0, atol=1e-9)
