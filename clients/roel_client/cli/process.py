@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
@@ -15,6 +16,7 @@ ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 # A child that cancels work on a server gets this long before it is killed; the contract gives 2 s
 # for everything.
 GRACE_S = 1.5
+POLL_INTERVAL_S = 0.01
 
 
 class Interrupted(BaseException):
@@ -25,6 +27,9 @@ class Interrupted(BaseException):
         self.exit_code = 128 + number
 
 
+SignalHandler = Callable[[int, FrameType | None], object]
+
+
 @contextmanager
 def interruptible() -> Iterator[None]:
     """The first SIGINT or SIGTERM raises `Interrupted`; later ones wait until all is cleaned up."""
@@ -33,12 +38,19 @@ def interruptible() -> Iterator[None]:
         ignore_signals()
         raise Interrupted(number)
 
-    previous = {number: signal.signal(number, interrupt) for number in ENDING_SIGNALS}
+    with signals_handled(interrupt):
+        yield
+
+
+@contextmanager
+def signals_handled(handler: SignalHandler) -> Iterator[None]:
+    """SIGINT and SIGTERM go to this handler."""
+    previous = {number: signal.signal(number, handler) for number in ENDING_SIGNALS}
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number, old in previous.items():
+            signal.signal(number, old)
 
 
 def ignore_signals() -> None:
@@ -56,40 +68,59 @@ def run_in_child(work: Callable[[], int]) -> int:
     Raises:
         Interrupted: after the child has ended.
     """
-    # Held back around the fork: the child must not meet a signal with its parent's handlers.
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-    child = os.fork()
-    if child == 0:
-        _become(work)
+    # A handler that raises in the middle of the fork would be lost there, so signals are only noted.
+    noted: list[int] = []
+    child = 0
     try:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
-        _, status = os.waitpid(child, 0)
+        with signals_handled(lambda number, frame: noted.append(number)):
+            child = os.fork()
+            if child == 0:
+                _become(work, noted)
+        if noted:
+            signal.raise_signal(noted[0])
+        return _exit_code(child)
     except Interrupted:
-        _stop(child)
+        if child:
+            _stop(child)
         raise
-    return os.waitstatus_to_exitcode(status)
 
 
-def _become(work: Callable[[], int]) -> NoReturn:
+def _become(work: Callable[[], int], noted: list[int]) -> NoReturn:
     """Be the child: default signal actions, and never return into the parent's frames."""
     code = 1
     try:
         for number in ENDING_SIGNALS:
             signal.signal(number, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+        if noted:
+            signal.raise_signal(noted[0])
         code = work()
     finally:
         os._exit(code)
 
 
-def _stop(child: int) -> None:
-    """End the child: politely, then for certain."""
-    os.kill(child, signal.SIGTERM)
-    deadline = time.monotonic() + GRACE_S
-    while time.monotonic() < deadline:
-        ended, _ = os.waitpid(child, os.WNOHANG)
+def _exit_code(child: int, until_s: float = math.inf) -> int:
+    """Wait for the child's end, at most until a time of `time.monotonic`.
+
+    It is asked again and again: a signal that arrives just before a blocking wait begins would be
+    noticed only after it.
+
+    Raises:
+        TimeoutError: it has not ended by then.
+    """
+    while time.monotonic() < until_s:
+        ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
-            return
-        time.sleep(0.01)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(POLL_INTERVAL_S)
+    raise TimeoutError
+
+
+def _stop(child: int) -> None:
+    """End the child: politely, then for certain; it may have ended by itself just now."""
+    with suppress(ProcessLookupError, ChildProcessError):
+        os.kill(child, signal.SIGTERM)
+        try:
+            _exit_code(child, time.monotonic() + GRACE_S)
+        except TimeoutError:
+            os.kill(child, signal.SIGKILL)
+            _exit_code(child)
