@@ -26,8 +26,8 @@ class SensorModel:
         hot_pixel_share, hot_pixel_hz: some pixels fire far more often.
     """
 
-    threshold: float = 0.22
-    threshold_mismatch: float = 0.03
+    threshold: float = 0.3
+    threshold_mismatch: float = 0.035
     refractory_us: float = 300.0
     shot_noise_hz: float = 0.5
     hot_pixel_share: float = 2e-4
