@@ -38,8 +38,9 @@ RETRY_POLICY = {
     "retryableStatusCodes": ["UNAVAILABLE"],
 }
 
-# Uploads and watches are taken up again where they broke; a server restarts within this time.
-PAUSES_S = (0.2, 0.5, 1.0, 2.0, 4.0)
+# Uploads and watches are taken up again where they broke; even a busy machine restarts a server
+# within this time.
+PAUSES_S = (0.2, 0.5, 1.0, 2.0, 4.0, 8.0)
 
 _jitter = random.SystemRandom()
 

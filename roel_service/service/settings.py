@@ -16,7 +16,6 @@ class Settings:
 
     Attributes:
         message_in_bytes, message_out_bytes: largest request and answer.
-        events_per_chunk: fixed by the format of chunks.
         event_stream_bytes: largest recording, compressed.
         pose_count: most poses of a recording.
         concurrent_builds: children at a time.
@@ -29,7 +28,6 @@ class Settings:
 
     message_in_bytes: int = 4 * MIB
     message_out_bytes: int = 8 * MIB
-    events_per_chunk: int = MAX_CHUNK_EVENT_COUNT
     event_stream_bytes: int = 10 * GIB
     pose_count: int = 1_000_000
     concurrent_builds: int = 2
@@ -38,3 +36,8 @@ class Settings:
     download_part_bytes: int = MIB
     drain_grace_s: float = 2.0
     build_entrypoint: str = "roel_service.jobs.build:run_build"
+
+    @property
+    def events_per_chunk(self) -> int:
+        """Most events of a chunk; the format decides."""
+        return MAX_CHUNK_EVENT_COUNT

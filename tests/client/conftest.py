@@ -2,7 +2,7 @@ import pytest
 
 from roel_client import Client
 
-from ..service.processes import Server
+from ..service.processes import Server, servers
 
 
 @pytest.fixture(scope="module")
@@ -16,3 +16,10 @@ def server(tmp_path_factory):
 def client(server):
     with Client(server.address) as connected:
         yield connected
+
+
+@pytest.fixture
+def start_server(tmp_path):
+    """Starts a server on the test's own data folder."""
+    with servers(tmp_path / "data") as start:
+        yield start

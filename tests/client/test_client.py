@@ -19,7 +19,7 @@ from roel_service.scene.results import MAPPING_STAGES
 from roel_service.v1 import events_pb2, events_pb2_grpc, maps_pb2, maps_pb2_grpc
 from roel_service.wire.rlm import decode_map
 
-from ..service.processes import CAMERA, Server, config_of, events_of, new_id, trajectory_of
+from ..service.processes import CAMERA, config_of, events_of, new_id, trajectory_of
 from ..service.sample_builds import BUG, NO_ANSWER, QUICK, SLOW
 
 # Nothing listens on the discard port of loopback.
@@ -118,9 +118,9 @@ def test_poses_of_many_messages_arrive_whole(client):
     client.delete_event_stream(stream)
 
 
-def test_an_upload_continues_on_the_server_that_took_over(tmp_path):
+def test_an_upload_continues_on_the_server_that_took_over(start_server):
     """The server is killed while it receives; its successor gets only what it does not have."""
-    first = Server(tmp_path / "data", commit_bytes=1)
+    first = start_server(commit_bytes=1)
     successors = []
 
     class Source:
@@ -133,7 +133,7 @@ def test_an_upload_continues_on_the_server_that_took_over(tmp_path):
             yield events
             if not successors:
                 first.kill()
-                successors.append(Server(tmp_path / "data", port=first.port))
+                successors.append(start_server(port=first.port))
 
     with Client(first.address) as client:
         stream = client.create_event_stream("walk", CAMERA)
@@ -145,9 +145,9 @@ def test_an_upload_continues_on_the_server_that_took_over(tmp_path):
     assert successors[0].stop() == 0
 
 
-def test_a_watch_outlives_a_broken_connection(tmp_path):
+def test_a_watch_outlives_a_broken_connection(start_server):
     """The server is killed during a build; the one that follows tells how it ended."""
-    first = Server(tmp_path / "data")
+    first = start_server()
     at_work = threading.Event()
     with Client(first.address) as client:
         stream = client.create_event_stream("walk", CAMERA)
@@ -167,7 +167,7 @@ def test_a_watch_outlives_a_broken_connection(tmp_path):
         waiting.start()
         at_work.wait()
         first.kill()
-        second = Server(tmp_path / "data", port=first.port)
+        second = start_server(port=first.port)
         waiting.join()
     assert outcome[0].reason == "WORKER_LOST"
     assert second.stop() == 0

@@ -3,7 +3,7 @@ import pytest
 from roel_client import Client
 from roel_client.connection import Connection
 
-from .processes import Server
+from .processes import Server, servers
 
 
 @pytest.fixture(scope="module")
@@ -32,3 +32,10 @@ def connection(server):
     opened = Connection(server.address)
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def start_server(tmp_path):
+    """Starts a server on the test's own data folder."""
+    with servers(tmp_path / "data") as start:
+        yield start

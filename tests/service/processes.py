@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import uuid
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +61,21 @@ class Server:
         return self._end()
 
     def _end(self):
-        code = self.process.wait(30)
-        self.process.stdout.close()
-        return code
+        with self.process:
+            return self.process.wait(30)
+
+
+@contextmanager
+def servers(folder):
+    """A function that starts servers on one folder; none of them outlives the block."""
+    with ExitStack() as started:
+
+        def start(**options):
+            server = Server(folder, **options)
+            started.callback(server.kill)
+            return server
+
+        yield start
 
 
 def wait_until(condition, timeout_s=30.0):

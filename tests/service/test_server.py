@@ -24,7 +24,7 @@ from roel_service.service.server import SERVICES, serve
 from roel_service.v1 import events_pb2, events_pb2_grpc
 from roel_service.wire.chunks import encode_chunk, split_chunks
 
-from .processes import CAMERA, Server, config_of, events_of, new_id, ready_recording, wait_until
+from .processes import CAMERA, config_of, events_of, new_id, ready_recording, wait_until
 from .sample_builds import QUICK, SLOW
 
 HEAVY = ("torch", "open3d", "cv2", "numba", "llvmlite")
@@ -133,8 +133,8 @@ def test_another_host_is_served_when_that_is_wanted(folder):
         assert process.wait(30) == 0
 
 
-def test_committed_chunks_survive_a_killed_server(folder):
-    first = Server(folder, commit_bytes=1)
+def test_committed_chunks_survive_a_killed_server(start_server):
+    first = start_server(commit_bytes=1)
     killed = threading.Event()
 
     def requests(stream):
@@ -161,7 +161,7 @@ def test_committed_chunks_survive_a_killed_server(folder):
         first.kill()
         killed.set()
         uploading.join()
-    second = Server(folder)
+    second = start_server()
     with Client(second.address) as client:
         record = client.event_stream(stream)
         assert (record.chunk_count, record.event_count) == (2, 262_144)
@@ -170,14 +170,14 @@ def test_committed_chunks_survive_a_killed_server(folder):
     assert second.stop() == 0
 
 
-def test_a_build_fails_as_lost_when_its_server_was_killed(folder):
-    first = Server(folder)
+def test_a_build_fails_as_lost_when_its_server_was_killed(start_server):
+    first = start_server()
     with Client(first.address) as client:
         map_name = client.create_map("house")
         name = client.build_map(map_name, ready_recording(client), config_of(SLOW)).name
         child = first.child_pid()
         first.kill()
-    second = Server(folder)
+    second = start_server()
     with (
         Client(second.address) as client,
         pytest.raises(UnavailableError, match="a server that ended during the build"),
@@ -187,8 +187,8 @@ def test_a_build_fails_as_lost_when_its_server_was_killed(folder):
     assert second.stop() == 0
 
 
-def test_a_draining_server_ends_its_builds_and_answers_whoever_waits(folder):
-    server = Server(folder)
+def test_a_draining_server_ends_its_builds_and_answers_whoever_waits(start_server):
+    server = start_server()
     with Client(server.address) as client:
         map_name = client.create_map("house")
         operation = client.build_map(map_name, ready_recording(client), config_of(SLOW))
