@@ -115,7 +115,8 @@ class TestReassociate:
         assert len(found.tracks.observation) == len(exact.line_of)
         assert np.abs(exact.observations.normal_speed_px_per_ms).max() > 0.05
 
-    def test_directions_of_segments_do_not_matter(self):
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_directions_of_segments_and_lines_do_not_matter(self, sign):
         exact = world()
         flipped = dataclasses.replace(
             exact.observations,
@@ -123,7 +124,9 @@ class TestReassociate:
             normal_speed_px_per_ms=-exact.observations.normal_speed_px_per_ms,
         )
         turned = dataclasses.replace(exact, observations=flipped)
-        lines = InfiniteLines(direction=-exact.lines.direction, moment=-exact.lines.moment)
+        lines = InfiniteLines(
+            direction=sign * exact.lines.direction, moment=sign * exact.lines.moment
+        )
         tracks = LineTracks.from_lists([exact.tracks[j][:8] for j in range(12)])
         found = reassociated(turned, tracks, lines)
         np.testing.assert_array_equal(found.tracks.observation, exact.tracks.observation)
