@@ -5,8 +5,8 @@ import pytest
 
 from roel_service.config.stages import Config, MatchGlobalConfig, RefineConfig
 from roel_service.errors import Cancelled
-from roel_service.geometry import projection, segments
-from roel_service.mapping.match_global import project_segments, reassociate
+from roel_service.geometry import plucker, projection, segments
+from roel_service.mapping.match_global import _exclusive, project_segments, reassociate
 from roel_service.mapping.refine import refine_lines
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
@@ -175,6 +175,21 @@ class TestExclusive:
         found = reassociated(exact, rows, lines, config)
         # None shares more than all: both stay in the rounds, and one gets everything in the end.
         np.testing.assert_array_equal(found.tracks.sizes, [24])
+
+    @pytest.mark.parametrize(("size", "winner"), [(3, 0), (24, 1)])
+    def test_a_large_line_wins_against_a_slightly_better_small_one(self, size, winner):
+        exact = world(lines=(3,))
+        tracks = LineTracks.from_lists([exact.tracks[0], exact.tracks[0][:size]])
+        _, refined = first_lines(exact, tracks, exact.lines.take(np.array([0, 0])))
+        # The larger line is 6 mm, some 0.3 px, off; ln(24 / 3) counts for 0.6 px.
+        beside = exact.segments + np.array([0.006, 0.0, 0.0])
+        direction, moment = plucker.plucker_from_endpoints(np.concatenate([beside, exact.segments]))
+        lines = InfiniteLines(direction=direction, moment=moment)
+        refined = dataclasses.replace(refined, lines=lines, tracks=tracks)
+        found = _exclusive(refined, exact.views, exact.frames)
+        assert found.is_exclusive()
+        assert np.argmax(found.sizes) == winner
+        assert found.sizes.max() == 24
 
 
 class TestDegenerate:
