@@ -42,7 +42,7 @@ PAPER = Config(
         loss="squared",
         event_weight=1e4,
         event_count_per_line=50,
-        max_residual_px=UNLIMITED,
+        max_residual_px=20.0,
     ),
     trim=TrimConfig(
         method="cluster",

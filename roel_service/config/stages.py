@@ -41,6 +41,11 @@ SOME_POSITIVE = Rule(
 )
 
 
+def at_most(limit: float) -> Rule:
+    """A positive number up to a limit that keeps time and memory of a run bounded."""
+    return Rule(f"> 0 and <= {limit:g}", lambda value: 0 < value <= limit)
+
+
 def one_of(names: tuple[str, ...]) -> Rule:
     """The value is one of these names."""
     return Rule("one of " + ", ".join(names), lambda value: value in names)
@@ -88,8 +93,8 @@ class FramesConfig(Stage, table="frames"):
         min_half_window_us, max_half_window_us: bounds of every window around a frame's time.
     """
 
-    rate_hz: float = parameter(30.0, POSITIVE)
-    min_frame_count: int = parameter(24, POSITIVE)
+    rate_hz: float = parameter(30.0, at_most(1000))
+    min_frame_count: int = parameter(24, at_most(1000))
     compensate_rotation: bool = True
     slot_us: int = parameter(500, POSITIVE)
     min_half_window_us: int = parameter(6_000, POSITIVE)
@@ -158,18 +163,18 @@ class PlaneFitConfig(Stage, table="plane_fit"):
     candidate_distance_px: float = parameter(5.0, POSITIVE)
     extension_px: float = parameter(24.0, NOT_NEGATIVE)
     time_scale_px_per_ms: float = parameter(20.0, POSITIVE)
-    trial_count: int = parameter(64, POSITIVE)
+    trial_count: int = parameter(64, at_most(10_000))
     inlier_distance_px: float = parameter(0.8, POSITIVE)
     min_inlier_count: int = parameter(10, POSITIVE)
     max_speed_widths_per_s: float = parameter(0.5625, POSITIVE)
-    speed_count: int = parameter(25, AT_LEAST_TWO)
-    support_bin_px: float = parameter(3.0, POSITIVE)
+    speed_count: int = parameter(25, Rule("2 to 1000", lambda value: 2 <= value <= 1000))
+    support_bin_px: float = parameter(3.0, Rule(">= 0.1", lambda value: value >= 0.1))
     max_gap_bin_count: int = parameter(3, NOT_NEGATIVE)
     min_occupancy: float = parameter(0.6, SHARE)
     min_density_ratio: float = parameter(1.6, NOT_NEGATIVE)
     duplicate_distance_px: float = parameter(1.3, NOT_NEGATIVE)
     duplicate_overlap: float = parameter(0.6, SHARE)
-    support_event_count: int = parameter(400, POSITIVE)
+    support_event_count: int = parameter(400, at_most(100_000))
     support_half_window_us: int = parameter(12_000, POSITIVE)
 
 
@@ -239,8 +244,10 @@ class TriangulateConfig(Stage, table="triangulate"):
 
     gate: str = parameter("pixel", one_of(TRIANGULATE_GATES))
     min_observation_count: int = parameter(3, AT_LEAST_TWO)
-    pair_count: int = parameter(60, POSITIVE)
-    scored_observation_count: int = parameter(40, AT_LEAST_TWO)
+    pair_count: int = parameter(60, at_most(1000))
+    scored_observation_count: int = parameter(
+        40, Rule("2 to 1000", lambda value: 2 <= value <= 1000)
+    )
     min_plane_angle_deg: float = parameter(0.4, POSITIVE)
     max_residual_px: float = parameter(2.5, POSITIVE)
     max_grassmann_angle_deg: float = parameter(1.4, POSITIVE)
@@ -277,7 +284,7 @@ class RefineConfig(Stage, table="refine"):
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
-    iteration_count: int = parameter(8, POSITIVE)
+    iteration_count: int = parameter(8, at_most(1000))
     max_residual_px: float = parameter(2.0, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
 
@@ -326,7 +333,7 @@ class RuntimeConfig(Stage, table="runtime"):
     """
 
     seed: int = parameter(0, NOT_NEGATIVE)
-    worker_count: int = parameter(0, NOT_NEGATIVE)
+    worker_count: int = parameter(0, Rule("0 to 256", lambda value: 0 <= value <= 256))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -16,11 +16,15 @@ from roel_service.scene.lines import LineObservations, LineTracks
 
 
 def match_adjacent_frames(
-    observations: LineObservations, frames: Frames, config: MatchLocalConfig
+    observations: LineObservations,
+    frames: Frames,
+    config: MatchLocalConfig,
+    *,
+    rotation_is_undone: bool = True,
 ) -> LineTracks:
     """Link lines of neighbouring frames into tracks, at most one line of a frame in each.
 
-    A track stays open for `reach_frame_count` frames; every line starts or continues one.
+    `rotation_is_undone` says that the observed speeds are those of a camera that does not turn. A track stays open for `reach_frame_count` frames; every line starts or continues one.
     """
     first = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
     track = np.full(len(observations), -1)
@@ -30,7 +34,9 @@ def match_adjacent_frames(
         current = np.arange(first[frame], first[frame + 1])
         reach = observations.frame[open_ends] >= frame - config.reach_frame_count
         open_ends = open_ends[reach]
-        before, after = _mutual_nearest(open_ends, current, observations, frames, config)
+        before, after = _mutual_nearest(
+            open_ends, current, observations, frames, config, rotation_is_undone
+        )
         track[after] = track[before]
         new = current[track[current] < 0]
         track[new] = track_count + np.arange(len(new))
@@ -46,11 +52,12 @@ def _mutual_nearest(
     observations: LineObservations,
     frames: Frames,
     config: MatchLocalConfig,
+    rotation_is_undone: bool,
 ) -> tuple[IntArray, IntArray]:
     """Pairs of observations that are each other's nearest and pass the gates."""
     if len(before) == 0 or len(after) == 0:
         return before[:0], after[:0]
-    cost = _cost(before, after, observations, frames, config)
+    cost = _cost(before, after, observations, frames, config, rotation_is_undone)
     nearest_after = cost.argmin(axis=1)
     nearest_before = cost.argmin(axis=0)
     mutual = nearest_before[nearest_after] == np.arange(len(before))
@@ -64,16 +71,23 @@ def _cost(
     observations: LineObservations,
     frames: Frames,
     config: MatchLocalConfig,
+    rotation_is_undone: bool,
 ) -> FloatArray:
     """(B, A) distances in px, infinite where polarity or overlap forbid the pair."""
     lines_before = observations.segments_px[before][:, None]
     lines_after = observations.segments_px[after][None]
     if config.predict:
-        moved = predict(before, observations.frame[after[:1]], observations, frames)[:, None]
+
+        def moved_to(frame: Array, indices: IntArray) -> FloatArray:
+            return predict(
+                indices, frame, observations, frames, rotation_is_undone=rotation_is_undone
+            )
+
+        moved = moved_to(observations.frame[after[:1]], before)[:, None]
         returned = np.empty((len(before), len(after), 2, 2))
         for frame in np.unique(observations.frame[before]):
             rows = observations.frame[before] == frame
-            returned[rows] = predict(after, np.array([frame]), observations, frames)
+            returned[rows] = moved_to(np.array([frame]), after)
         cost = 0.5 * (_one_way(moved, lines_after) + _one_way(returned, lines_before))
         facing = facing_share(moved, lines_after)
     else:
@@ -85,21 +99,29 @@ def _cost(
 
 
 def predict(
-    indices: IntArray, to_frame: Array, observations: LineObservations, frames: Frames
+    indices: IntArray,
+    to_frame: Array,
+    observations: LineObservations,
+    frames: Frames,
+    *,
+    rotation_is_undone: bool = True,
 ) -> FloatArray:
     """(n, 2, 2) where observed lines lie in another frame: moved by their speed, then turned.
 
-    The normal speed lives in the pixels of the line's own frame, with its rotation undone.
+    Where its speed has the camera's rotation undone, a line is moved in the pixels of its own frame
+    and the rotation is added; else the speed holds the rotation already.
     """
     lines_px = observations.segments_px[indices]
     own_frame = observations.frame[indices]
     left = segments.left_normal(lines_px)
     step_ms = (frames.t_us[to_frame] - frames.t_us[own_frame]) * 1e-3
     shift = (observations.normal_speed_px_per_ms[indices] * step_ms)[:, None] * left
+    moved = lines_px + shift[:, None]
+    if not rotation_is_undone:
+        return np.asarray(moved)
     R = frames.T_world_camera.rotation
     R_to_own = np.swapaxes(R[to_frame], -1, -2) @ R[own_frame]
     H = frames.K @ R_to_own @ np.linalg.inv(frames.K)
-    moved = lines_px + shift[:, None]
     homogeneous = moved @ np.swapaxes(H[:, :, :2], -1, -2) + H[:, None, :, 2]
     return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
 

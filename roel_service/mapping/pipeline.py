@@ -80,7 +80,12 @@ def build_line_map(
     frames, observations = _lines_of_all_frames(counted, trajectory, camera, config, detector, run)
     counted.check_coverage()
     with run.stage("match_local"):
-        tracks = match_adjacent_frames(observations, frames, config.match_local)
+        tracks = match_adjacent_frames(
+            observations,
+            frames,
+            config.match_local,
+            rotation_is_undone=config.frames.compensate_rotation,
+        )
         evidence = measure_evidence(observations, frames, trajectory, config.frames, config.refine)
     if config.match_global.method == "sampled":
         with run.stage("match_global"):

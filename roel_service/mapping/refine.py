@@ -15,7 +15,7 @@ Two costs, see `RefineConfig.residual`:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,7 +51,8 @@ class Refined:
         tracks: the inliers of each line.
         rms_px: (L,) root mean square of the inliers' larger end residual.
         origin: (L, 3) m, world, about which each line was solved.
-        information: (L, 4, 4) in the orthonormal tangent about the origin, 1/px^2 for `pixel`.
+        information: (L, 4, 4) Hessian of the `pixel` cost, whichever was minimised, in the
+            orthonormal tangent about the origin; 1/px^2.
         diverged: (L,) fewer inliers than needed, or no finite solution.
     """
 
@@ -210,11 +211,13 @@ class _Problem:
         )
 
     def _middles_m(self, state: _State) -> FloatArray:
-        """(L,) mean arc length of the observed ends."""
+        """(L,) mean arc length of the middles of the observed intervals that cut the line."""
         v, m = state.plucker
         local = Views(**(vars(self.views) | {"centre": self.centre}))
         cuts, _ = cuts_m(local, v[self.line], m[self.line])
-        return self.mean(np.nan_to_num(cuts.mean(axis=-1)))
+        middles = cuts.mean(axis=-1)
+        counts = self.total(np.isfinite(middles).astype(np.float64))
+        return self.total(np.nan_to_num(middles)) / np.maximum(counts, 1.0)
 
 
 def refine_lines(
@@ -246,8 +249,13 @@ def refine_lines(
         state, damping = _step(problem, state, weight, damping)
     residual_px = problem.residual_px(state)
     inlier = problem.inliers(residual_px, loose=False)
-    system = problem.system(state, problem.robust_weight(residual_px) * inlier)
-    return _refined(problem, tracks, state, residual_px, inlier, system)
+    weight = problem.robust_weight(residual_px) * inlier
+    in_pixels = problem
+    if config.residual != "pixel":
+        metric = replace(config, residual="pixel", event_weight=1.0)
+        in_pixels = _Problem(lines, tracks, evidence, frames, metric)
+    information = in_pixels.system(state, weight).hessian
+    return _refined(problem, tracks, state, residual_px, inlier, information)
 
 
 def _step(
@@ -280,19 +288,19 @@ def _refined(
     state: _State,
     residual_px: FloatArray,
     inlier: BoolArray,
-    system: _System,
+    information: FloatArray,
 ) -> Refined:
     direction, moment = state.plucker
     moment = plucker.shift_origin(direction, moment, -problem.origin)
     counts = problem.total(inlier.astype(np.float64))
     squares = problem.total(np.where(inlier, residual_px**2, 0.0))
-    finite = np.isfinite(moment).all(axis=-1) & np.isfinite(system.hessian).all(axis=(-2, -1))
+    finite = np.isfinite(moment).all(axis=-1) & np.isfinite(information).all(axis=(-2, -1))
     kept = tracks.observation[inlier]
     return Refined(
         lines=InfiniteLines(direction=direction, moment=moment),
         tracks=LineTracks(offsets=np.concatenate([[0], np.cumsum(counts)]), observation=kept),
         rms_px=np.sqrt(squares / np.maximum(counts, 1.0)),
         origin=problem.origin,
-        information=system.hessian,
+        information=information,
         diverged=~finite | (counts < problem.config.min_inlier_count),
     )

@@ -45,7 +45,7 @@ class MappingReport:
         event_count: events used.
         left_out_event_count: events outside the poses or in a gap of them.
         observation_count: 2D lines that passed the plane fit.
-        track_status_count: how many tracks ended in each status.
+        track_status_count: how many tracks, or pieces of lines, ended in each status.
         seconds: wall-clock time of each of `MAPPING_STAGES`.
     """
 
