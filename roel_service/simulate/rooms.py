@@ -114,16 +114,16 @@ def furnished_room(rng: np.random.Generator) -> Scene:
     size = np.array([rng.uniform(4.2, 5.6), rng.uniform(4.2, 5.4), rng.uniform(2.5, 2.9)])
     build = SceneBuilder()
     _shell(build, size, rng)
-    walls = [_Wall(side, size) for side in range(4)]
+    walls = [Wall(side, size) for side in range(4)]
     order = rng.permutation(4)
     # What stands in a corner stands at this end of its wall, so that no two share a corner.
     hand = rng.choice([-1.0, 1.0])
     _door(build, walls[order[0]], -hand, rng)
     _window(build, walls[order[1]], rng)
     _window(build, walls[order[2]], rng)
+    _shelf(build, walls[order[3]], hand, rng)
     for wall in walls:
         _pictures(build, wall, rng)
-    _shelf(build, walls[order[3]], hand, rng)
     _cabinet(build, walls[order[1]], hand, rng)
     _sofa(build, walls[order[2]], hand, rng)
     _desk(build, walls[order[0]], hand, rng)
@@ -131,7 +131,7 @@ def furnished_room(rng: np.random.Generator) -> Scene:
     return build.scene()
 
 
-class _Wall:
+class Wall:
     """One wall as a frame: along it to the right as seen from inside, up, and into the room."""
 
     def __init__(self, side: int, size: FloatArray) -> None:
@@ -143,6 +143,16 @@ class _Wall:
         self.height_m = float(size[2])
         middle = np.array([size[0] / 2, size[1] / 2, 0.0])
         self.foot = middle - self.inward * abs(self.inward @ size) / 2
+        self._taken: list[tuple[float, float]] = []
+
+    def take(self, along_m: float, width_m: float) -> None:
+        """Keep a stretch about `along_m` free of pictures."""
+        self._taken.append((along_m - width_m / 2, along_m + width_m / 2))
+
+    def is_free(self, along_m: float, width_m: float) -> bool:
+        """Whether nothing was taken within `width_m` about `along_m`."""
+        low, high = along_m - width_m / 2, along_m + width_m / 2
+        return all(high < begin or low > end for begin, end in self._taken)
 
     def at(self, along_m: float, up_m: float, out_m: float) -> FloatArray:
         """Point at a distance from the wall's middle, from the floor and from the wall."""
@@ -176,7 +186,7 @@ def _shell(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> N
     board = build.texture(textures.plain(rng.uniform(0.15, 0.35) * np.array([1.0, 0.9, 0.8])))
     cornice = build.texture(textures.plain(np.full(3, 0.95)))
     for side in range(4):
-        edge = _Wall(side, size)
+        edge = Wall(side, size)
         edge.box(build, (0.0, 0.05, 0.0), (edge.width_m, 0.015, 0.1), board)
         edge.box(build, (0.0, size[2] - 0.04, 0.0), (edge.width_m, 0.05, 0.08), cornice)
     for share in (0.3, 0.7):
@@ -195,7 +205,7 @@ def _lamp(build: SceneBuilder, place: FloatArray) -> None:
     build.box(place - [0.0, 0.0, 0.03], np.array([1.0, 0.25, 0.05]), light)
 
 
-def _door(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+def _door(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
     along = hand * rng.uniform(0.1, 0.25) * wall.width_m
     frame = build.texture(textures.plain(rng.uniform(0.75, 0.9) * np.ones(3)))
     leaf = rng.uniform(0.2, 0.5) * np.array([1.0, 0.75, 0.5])
@@ -204,28 +214,31 @@ def _door(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generato
     for side in (-1, 1):
         wall.box(build, (along + side * 0.49, 1.02, 0.0), (0.08, 0.05, 2.04), frame)
     wall.box(build, (along, 2.08, 0.0), (1.06, 0.05, 0.08), frame)
+    wall.take(along, 1.06)
 
 
-def _window(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _window(build: SceneBuilder, wall: Wall, rng: np.random.Generator) -> None:
     width, height = rng.uniform(0.9, 1.5), rng.uniform(0.9, 1.2)
     along = rng.uniform(-0.3, 0.3) * (wall.width_m - width)
     frame = build.texture(textures.plain(np.full(3, 0.88)))
     view = build.texture(textures.window(rng))
     wall.box(build, (along, 1.55, 0.0), (width, 0.02, height), frame, view)
     wall.box(build, (along, 1.55 - height / 2 - 0.03, 0.0), (width + 0.16, 0.14, 0.04), frame)
+    wall.take(along, width + 0.16)
 
 
-def _pictures(build: SceneBuilder, wall: _Wall, rng: np.random.Generator) -> None:
+def _pictures(build: SceneBuilder, wall: Wall, rng: np.random.Generator) -> None:
+    """A picture on either side, where the wall is free."""
     for side in (-1, 1):
-        if rng.random() < 0.75:
-            width, height = rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.6)
-            place = (side * rng.uniform(0.3, 0.4) * wall.width_m, rng.uniform(1.4, 1.8), 0.0)
+        width, height = rng.uniform(0.4, 0.8), rng.uniform(0.3, 0.6)
+        place = (side * rng.uniform(0.25, 0.4) * wall.width_m, rng.uniform(1.4, 1.8), 0.0)
+        if wall.is_free(place[0], width):
             rim = build.texture(textures.plain(rng.uniform(0.05, 0.3, 3)))
             picture = build.texture(textures.poster(rng))
             wall.box(build, place, (width, 0.03, height), rim, picture)
 
 
-def _shelf(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+def _shelf(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
     """A bookshelf with boards and books."""
     width, depth, height = rng.uniform(0.9, 1.4), 0.28, rng.uniform(1.6, 2.0)
     along = hand * rng.uniform(0.0, 0.3) * (wall.width_m - width)
@@ -236,6 +249,7 @@ def _shelf(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generat
     levels = np.linspace(0.05, height, 6)
     for level in levels:
         wall.box(build, (along, level, 0.0), (width, depth, 0.02), wood)
+    wall.take(along, width)
     spines = [build.texture(textures.plain(rng.uniform(0.04, 0.85, 3))) for _ in range(8)]
     for level in levels[:-1]:
         position = -width / 2 + 0.03
@@ -248,7 +262,7 @@ def _shelf(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generat
             position += thick
 
 
-def _cabinet(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+def _cabinet(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
     width, depth, height = rng.uniform(0.8, 1.4), 0.45, rng.uniform(0.6, 0.85)
     along = hand * (wall.width_m - width) * 0.4
     colour = rng.uniform(0.3, 0.75) * np.array([1.0, 0.95, 0.85])
@@ -260,7 +274,7 @@ def _cabinet(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Gener
     wall.box(build, (along, height + 0.27, 0.15), (0.75, 0.05, 0.44), screen, shown)
 
 
-def _sofa(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+def _sofa(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
     width = rng.uniform(1.3, 1.8)
     along = hand * rng.uniform(0.0, 0.2) * (wall.width_m - width)
     cloth = build.texture(textures.mottled(rng.uniform(0.15, 0.5, 3), 0.08, 128, rng))
@@ -272,7 +286,7 @@ def _sofa(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generato
     wall.box(build, (along + rng.uniform(-0.4, 0.4), 0.58, 0.32), (0.4, 0.12, 0.36), cushion)
 
 
-def _desk(build: SceneBuilder, wall: _Wall, hand: float, rng: np.random.Generator) -> None:
+def _desk(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
     """A desk with legs, a lamp, a monitor and a chair beside it."""
     width, depth, height = rng.uniform(1.0, 1.4), 0.6, 0.74
     along = hand * (wall.width_m / 2 - width / 2 - 0.1)

@@ -5,7 +5,7 @@ from roel_service.geometry.se3 import SE3
 from roel_service.simulate.motion import walk_in_room
 from roel_service.simulate.panoramas import FACE_ROTATIONS
 from roel_service.simulate.render import render, render_depth
-from roel_service.simulate.rooms import furnished_room, grid_cube
+from roel_service.simulate.rooms import Wall, furnished_room, grid_cube
 from roel_service.simulate.scenes import texture_atlas
 
 SEEDS = range(6)
@@ -56,6 +56,28 @@ def test_nothing_stands_in_the_way_of_the_walk(room):
         )
         # Depth along the axis of a view of 90 degrees: the distance is at most 1.7 times that.
         assert nearest_m > 0.2
+
+
+def test_what_hangs_on_a_wall_does_not_overlap():
+    wall = Wall(0, np.array([5.0, 4.0, 2.5]))
+    assert wall.is_free(0.0, 5.0)
+    wall.take(1.0, 0.8)
+    wall.take(-1.5, 0.4)
+    taken = [wall.is_free(along_m, 0.4) for along_m in (-1.5, -1.2, -1.0, 0.35, 0.5, 1.0, 1.65)]
+    assert taken == [False, False, True, True, False, False, True]
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_a_wall_is_a_frame_that_looks_into_the_room(side):
+    size = np.array([5.0, 4.0, 2.5])
+    wall = Wall(side, size)
+    for along_m in (-0.4, 0.4):
+        place = wall.at(along_m * wall.width_m, 1.0, 0.1)
+        assert (place > 0).all()
+        assert (place < size).all()
+        assert np.isclose(np.minimum(place, size - place)[:2].min(), 0.1)
+    # Seen from inside, with z up.
+    np.testing.assert_allclose(np.cross(wall.right, [0.0, 0.0, 1.0]), -wall.inward, atol=1e-12)
 
 
 def test_every_view_of_the_walk_has_contrast_to_see(room):
