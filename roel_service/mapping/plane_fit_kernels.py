@@ -317,18 +317,16 @@ def walk_support(
             best_first, best_last, best_full = first, last, full_count
     if best_last < 0:
         return 0.0, 0.0, 0.0
+    occupancy = best_full / (best_last - best_first + 1)
     # A lone bin beyond a gap is where another line crosses, not where this one ends.
-    while best_last > best_first and counts[best_last - 1] < full:
-        best_full -= 1
+    if best_first < best_last and counts[best_last - 1] < full:
         best_last -= 1
         while counts[best_last] < full:
             best_last -= 1
-    while best_first < best_last and counts[best_first + 1] < full:
-        best_full -= 1
+    if best_first < best_last and counts[best_first + 1] < full:
         best_first += 1
         while counts[best_first] < full:
             best_first += 1
-    occupancy = best_full / (best_last - best_first + 1)
     return best_first * size - reach, (best_last + 1) * size - reach, occupancy
 
 
