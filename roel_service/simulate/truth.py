@@ -76,11 +76,12 @@ def _edge_points(
     picture = render(scene, atlas, T_world_camera, K, *size)[..., 0]
     grey = np.rint(255.0 * picture.clip(0, 1) ** (1 / 2.2)).astype(np.uint8)
     depth_m = render_depth(scene, T_world_camera, K, *size)
-    # An edge belongs to the nearer of the surfaces that meet in it.
-    nearest_m = np.asarray(cv2.erode(depth_m, np.ones((3, 3))), dtype=np.float64)
+    # An edge belongs to the nearer of the surfaces that meet in it. By default OpenCV takes the
+    # largest finite number for the depth beyond the border, nearer than infinity.
+    nearest_m = cv2.erode(depth_m, np.ones((3, 3)), borderType=cv2.BORDER_REPLICATE)
     rows, columns = np.nonzero(cv2.Canny(grey, CANNY_LOW, CANNY_HIGH))
     hit = np.isfinite(nearest_m[rows, columns])
-    return _lifted(rows[hit], columns[hit], nearest_m, K, T_world_camera)
+    return _lifted(rows[hit], columns[hit], np.asarray(nearest_m), K, T_world_camera)
 
 
 def surface_cloud(

@@ -2,7 +2,9 @@ import numpy as np
 import pytest
 
 from roel_service.geometry.se3 import SE3
-from roel_service.simulate.rooms import furnished_room
+from roel_service.simulate import textures
+from roel_service.simulate.motion import looking_along
+from roel_service.simulate.rooms import SceneBuilder, furnished_room, grid_cube
 from roel_service.simulate.scenes import texture_atlas
 from roel_service.simulate.truth import (
     CLOUD_NOISE_M,
@@ -13,7 +15,7 @@ from roel_service.simulate.truth import (
     surface_cloud,
 )
 
-from .samples import DEPTH_M, FOCAL_PX, HEIGHT, WIDTH, K, wall_with_edge
+from .samples import DEPTH_M, FOCAL_PX, HEIGHT, WIDTH, K, unlit, wall_with_edge
 
 
 def step(done: int, total: int) -> None:
@@ -39,6 +41,47 @@ def test_edge_points_lie_on_the_edge(angle_rad):
     # The edge crosses the whole picture, whose shorter side is HEIGHT.
     assert np.ptp(along) > 0.9 * HEIGHT * DEPTH_M / FOCAL_PX
     assert len(edges) > HEIGHT
+
+
+def test_the_edges_of_the_cube_lie_on_its_rims_and_bars():
+    cube = grid_cube()
+    atlas = texture_atlas(cube.textures, grey=True)
+    places = np.array([[20.0, 12.0, 10.0], [20.0, 12.0, 10.0]])
+    poses = SE3(rotation=looking_along(-places), translation=places)
+    zoom = 4
+    sharp = K.copy()
+    sharp[:2] *= zoom
+    edges = observable_edges(cube, atlas, poses, sharp, zoom * WIDTH, zoom * HEIGHT, 2.0, step)
+    inward = np.sort(5.0 - np.abs(edges), axis=1)
+    # A pixel at the farthest corner, some 30 away, and half a voxel.
+    pixel = 30.0 / (zoom * FOCAL_PX) / EDGE_ZOOM
+    margin = pixel + EDGE_VOXEL_M
+    assert np.abs(inward[:, 0]).max() < margin
+    # On its face a point lies at the rim, the inner side of the rim's line, or beside the middle.
+    line = 10.0 / 64
+    from_rim, from_middle = inward[:, 1], np.sort(np.abs(edges), axis=1)[:, :2].min(axis=1)
+    distance = np.min(np.abs([from_rim, from_rim - line, from_middle - line]), axis=0)
+    # Canny errs by a pixel, the depth is that of a neighbour, and seen at 67 degrees from its normal,
+    # as the upper face is, a pixel covers 2.5 times as much. Cells are 5 wide: points strewn over
+    # the faces would lie farther off.
+    assert np.quantile(distance, 0.95) < 5 * margin
+    # Nothing of the three faces that cannot be seen, but their common rims.
+    assert (edges > -5.0 - margin).all()
+    assert len(edges) > 500
+
+
+def test_a_silhouette_at_the_border_of_the_picture_has_the_depth_of_its_surface():
+    # Upper half of the view, up to its border; the rest is background.
+    build = SceneBuilder()
+    corners = np.array([[-9.0, 0.0], [9.0, 0.0], [9.0, -9.0], [-9.0, -9.0]])
+    white = build.texture(textures.plain(np.ones(3)))
+    build.quad(np.column_stack([corners, np.full(4, DEPTH_M)]), white)
+    scene = unlit(build.scene())
+    atlas = texture_atlas(scene.textures, grey=True)
+    poses = SE3(rotation=np.tile(np.eye(3), (2, 1, 1)), translation=np.zeros((2, 3)))
+    edges = observable_edges(scene, atlas, poses, K, WIDTH, HEIGHT, 1.0, step)
+    assert len(edges) > WIDTH
+    np.testing.assert_allclose(edges[:, 2], DEPTH_M, atol=0.5 * EDGE_VOXEL_M + 1e-6)
 
 
 def test_what_is_seen_once_does_not_count():
