@@ -13,8 +13,9 @@ from roel_service.geometry.vectors import unit
 
 # Weights of red, green and blue in the brightness that the event sensor sees (ITU-R BT.601).
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
-# Light from above and one side: faces that meet at an edge differ in brightness.
-LIGHT = np.array([0.34, 0.19, 0.92])
+# Light from above and one side: faces that meet at an edge, and most walls that meet in a corner,
+# differ in brightness by more than an event's contrast.
+LIGHT = np.array([0.7, 0.4, 0.6])
 AMBIENT = 0.72
 
 
