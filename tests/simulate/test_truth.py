@@ -70,17 +70,20 @@ def test_the_edges_of_the_cube_lie_on_its_rims_and_bars():
     assert len(edges) > 500
 
 
-def test_a_silhouette_at_the_border_of_the_picture_has_the_depth_of_its_surface():
-    # Upper half of the view, up to its border; the rest is background.
+@pytest.mark.parametrize("angle_rad", np.linspace(0.1, 3.0, 12))
+def test_a_silhouette_that_leaves_the_picture_has_the_depth_of_its_surface(angle_rad):
+    # One half of the view, up to its border; the other is background.
     build = SceneBuilder()
-    corners = np.array([[-9.0, 0.0], [9.0, 0.0], [9.0, -9.0], [-9.0, -9.0]])
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    half = np.array([[-9.0, 0.0], [9.0, 0.0], [9.0, -9.0], [-9.0, -9.0]])
+    corners = half @ np.array([[cos, sin], [-sin, cos]])
     white = build.texture(textures.plain(np.ones(3)))
     build.quad(np.column_stack([corners, np.full(4, DEPTH_M)]), white)
     scene = unlit(build.scene())
     atlas = texture_atlas(scene.textures, grey=True)
     poses = SE3(rotation=np.tile(np.eye(3), (2, 1, 1)), translation=np.zeros((2, 3)))
     edges = observable_edges(scene, atlas, poses, K, WIDTH, HEIGHT, 1.0, step)
-    assert len(edges) > WIDTH
+    assert len(edges) > HEIGHT
     np.testing.assert_allclose(edges[:, 2], DEPTH_M, atol=0.5 * EDGE_VOXEL_M + 1e-6)
 
 
