@@ -60,8 +60,8 @@ def run_staged(
             return DONE
 
         code = run_in_child(lambda: answer(work, command_line))
+        ignore_signals()
         if code == DONE:
-            ignore_signals()
             publish(files, staged)
     return code if code >= 0 else ended_by_signal(-code, command_line)
 

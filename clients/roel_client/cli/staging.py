@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -88,14 +89,20 @@ def staging(files: NamedFiles) -> Iterator[Staged]:
     with ExitStack() as stack:
         staged = {}
         if files.scratch:
-            scratch = stack.enter_context(tempfile.TemporaryDirectory(prefix="roel-"))
-            staged["scratch"] = Path(scratch)
+            staged["scratch"] = _hidden_folder(stack, Path(tempfile.gettempdir()))
         for option, name in [*files.outputs.items(), *files.folders.items()]:
             place = Path(os.path.realpath(name))
-            folder = Path(tempfile.mkdtemp(prefix=".roel-", dir=place.parent))
-            stack.callback(shutil.rmtree, folder, ignore_errors=True)
-            staged[option] = folder / place.name
+            staged[option] = _hidden_folder(stack, place.parent) / place.name
         yield staged
+
+
+def _hidden_folder(stack: ExitStack, parent: Path) -> Path:
+    """A new folder for this user alone, removed when the stack unwinds."""
+    folder = parent / f".roel-{secrets.token_hex(8)}"
+    # Before it exists: a signal may raise between any two lines.
+    stack.callback(shutil.rmtree, folder, ignore_errors=True)
+    folder.mkdir(mode=0o700)
+    return folder
 
 
 def publish(files: NamedFiles, staged: Staged) -> None:
