@@ -19,7 +19,7 @@ Anything else that escapes is a bug.
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 
 class RoelError(Exception):
@@ -44,8 +44,8 @@ class RoelError(Exception):
         self.reason = reason or self.default_reason
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Errors cross process borders; `reason` is keyword-only and would be lost.
-        return (type(self), self.args, {"reason": self.reason})
+        # Errors cross process borders; what is keyword-only would be lost.
+        return (type(self), self.args, dict(vars(self)))
 
     def __str__(self) -> str:
         return " ".join(f"{self.subject}: expected {self.expected}, found {self.found}".split())
@@ -106,9 +106,26 @@ class ConfigError(InputError):
 
 
 class NoAnswerError(RoelError):
-    """Sound inputs with no answer in them."""
+    """Sound inputs with no answer in them.
+
+    Attributes:
+        result: what there is to tell all the same, such as the report of a build; None if nothing.
+    """
 
     default_reason = "NO_ANSWER"
+    result: dict[str, Any] | None = None
+
+    def __init__(
+        self,
+        subject: str,
+        expected: str,
+        found: str,
+        *,
+        reason: str | None = None,
+        result: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__(subject, expected, found, reason=reason)
+        self.result = result
 
 
 class NotFoundError(RoelError):

@@ -77,7 +77,7 @@ def build_map(
     """Build a map and pack it; equal inputs give equal bytes, here and on a server.
 
     Raises:
-        NoAnswerError: TOO_FEW_LINES.
+        NoAnswerError: TOO_FEW_LINES, with the report as its result.
         RoelError: whatever the source of events and the pipeline raise.
     """
     start_s = time.perf_counter()
@@ -91,9 +91,6 @@ def build_map(
     )
     rlm_bytes = encode_map(result.line_map, provenance)
     line_map = decode_map(rlm_bytes).line_map
-    if len(line_map) < MIN_LINE_COUNT:
-        expected = f"at least {MIN_LINE_COUNT} lines"
-        raise NoAnswerError("map", expected, f"{len(line_map)}", reason="TOO_FEW_LINES")
     report = {
         "frame_count": result.report.frame_count,
         "event_count": result.report.event_count,
@@ -104,6 +101,10 @@ def build_map(
         "config": to_tables(config),
         "versions": versions(),
     }
+    if len(line_map) < MIN_LINE_COUNT:
+        expected = f"at least {MIN_LINE_COUNT} lines"
+        found = f"{len(line_map)}"
+        raise NoAnswerError("map", expected, found, reason="TOO_FEW_LINES", result=report)
     return BuiltMap(rlm_bytes=rlm_bytes, line_map=line_map, report=report)
 
 

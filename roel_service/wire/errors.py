@@ -6,6 +6,8 @@ and found, so that a caller far away gets the exception that was raised here.
 
 from __future__ import annotations
 
+import json
+
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 
 from roel_service import errors
@@ -56,6 +58,8 @@ def status_from_error(error: RoelError | Cancelled) -> status_pb2.Status:
     info.metadata["error"] = type(error).__name__
     for key in ("subject", "expected", "found"):
         info.metadata[key] = getattr(error, key)[:MAX_TEXT_LENGTH]
+    if isinstance(error, errors.NoAnswerError) and error.result is not None:
+        info.metadata["result"] = json.dumps(error.result)
     code = next(code for kind, code in CODES if isinstance(error, kind))
     status = status_pb2.Status(code=code, message=str(error)[:MAX_TEXT_LENGTH])
     status.details.add().Pack(info)
@@ -79,6 +83,9 @@ def error_from_status(
         return kind(subject, "an answer", f"{code_pb2.Code.Name(status.code)}: {status.message}")
     kind = KINDS.get(info.metadata["error"], RoelError)
     texts = (info.metadata[key] for key in ("subject", "expected", "found"))
+    if kind is errors.NoAnswerError and "result" in info.metadata:
+        result = json.loads(info.metadata["result"])
+        return errors.NoAnswerError(*texts, reason=info.reason, result=result)
     return kind(*texts, reason=info.reason)
 
 

@@ -158,11 +158,22 @@ def test_recording_without_lines_has_no_answer(recording: Recording) -> None:
     assert not (recording.folder / "map.rlm").exists()
 
 
+def test_report_of_a_build_without_answer_is_printed_as_json(recording: Recording) -> None:
+    done = recording.build("--json")
+    assert done.returncode == 3, done.stderr
+    report = json.loads(done.stdout)
+    assert report["line_count"] < 3
+    assert report["event_count"] > 0
+    assert not (recording.folder / "map.rlm").exists()
+
+
 def test_server_answers_as_the_local_build_does(recording: Recording, server: str) -> None:
     assert roel("health", "--server", server, cwd=recording.folder).stdout == "SERVING\n"
     done = recording.build("--server", server)
     local = recording.build()
     assert (done.returncode, done.stdout, done.stderr) == (3, "", local.stderr)
+    told = json.loads(recording.build("--server", server, "--json").stdout)
+    assert told["line_count"] < 3
     move_event_off_the_sensor(recording)
     assert recording.build("--server", server).stderr == recording.build().stderr
     assert not (recording.folder / "map.rlm").exists()

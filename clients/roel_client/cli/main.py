@@ -12,7 +12,13 @@ import traceback
 from collections.abc import Callable, Sequence
 
 from roel_client.cli import configuration, demo, evaluate, health, maps, serve, simulate
-from roel_client.cli.output import LogHandler, logging_to_stderr, say, write_crash_report
+from roel_client.cli.output import (
+    LogHandler,
+    logging_to_stderr,
+    print_result,
+    say,
+    write_crash_report,
+)
 from roel_client.cli.parser import LOG_LEVELS, Command, Parser, UsageError
 from roel_client.cli.process import Interrupted, ignore_signals, interruptible, run_in_child
 from roel_client.cli.staging import NamedFiles, publish, staging
@@ -59,21 +65,31 @@ def run_staged(
             log.flush()
             return DONE
 
-        code = run_in_child(lambda: answer(work, command_line))
+        code = run_in_child(
+            lambda: answer(work, command_line, as_json=getattr(options, "json", False))
+        )
         ignore_signals()
         if code == DONE:
             publish(files, staged)
     return code if code >= 0 else ended_by_signal(-code, command_line)
 
 
-def answer(work: Callable[[], int], command_line: list[str]) -> int:
-    """Exit code of `work`; what it raises becomes one line on stderr and the code for it."""
+def answer(work: Callable[[], int], command_line: list[str], *, as_json: bool = False) -> int:
+    """Exit code of `work`; what it raises becomes one line on stderr and the code for it.
+
+    With `as_json` the result that comes with the lack of an answer goes to stdout.
+    """
     try:
         return work()
     except NoAnswerError as error:
+        if as_json and error.result is not None:
+            print_result(error.result, "", as_json=True)
         say(f"roel: no answer: {error}")
         return NO_ANSWER
     except RoelError as error:
+        if type(error) is RoelError:
+            # A server's fault: its log has the details.
+            return bug(str(error), command_line)
         say(f"roel: error: {error}")
         return UNUSABLE
     except Cancelled:
