@@ -12,7 +12,7 @@ demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	$(BIN)/roel demo --out demo-out
 
 test: check  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
-	$(BIN)/pytest $(PYTEST_ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 check: $(INSTALLED) stubs-are-current no-large-files  ## all that can be said without running the code
 	$(BIN)/ruff format --check .
