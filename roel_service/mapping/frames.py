@@ -14,7 +14,6 @@ import numpy as np
 
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import DetectConfig, FramesConfig
-from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3
 from roel_service.mapping import frames_kernels
 from roel_service.scene.camera import Camera
@@ -316,8 +315,3 @@ def frames_at(t_us: IntArray, trajectory: Trajectory, camera: Camera) -> Frames:
         width=camera.width,
         height=camera.height,
     )
-
-
-def undistortion_table(camera: Camera) -> Array:
-    """(H, W, 2) float32: ideal pinhole pixel of every raw pixel, NaN outside the model."""
-    return projection.undistortion_table(camera)

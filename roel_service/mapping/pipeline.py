@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roel_service.config.stages import Config
+from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
 from roel_service.mapping.detect import LineDetector, detect_lines, line_detector
 from roel_service.mapping.evidence import Evidence, measure_evidence
@@ -19,7 +20,6 @@ from roel_service.mapping.frames import (
     frame_slices,
     frame_times,
     frames_at,
-    undistortion_table,
 )
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_local import match_adjacent_frames

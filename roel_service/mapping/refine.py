@@ -26,7 +26,7 @@ from roel_service.geometry.vectors import dot
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.moments import camera_from_world_lines
-from roel_service.mapping.views import Views, cuts_m, end_residuals_px
+from roel_service.mapping.views import cuts_m, end_residuals_px
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
 # Damping relative to the diagonal: start, and factors after a good and a bad step.
@@ -114,9 +114,10 @@ class _Problem:
         self.focal_px = frames.focal_px
         self.offsets = tracks.offsets
         self.line = tracks.track_of_row
-        self.views = evidence.views.take(tracks.observation)
-        self.origin = self.mean(self.views.centre)
-        self.centre = self.views.centre - self.origin[self.line]
+        views = evidence.views.take(tracks.observation)
+        self.origin = self.mean(views.centre)
+        # As seen about the origin of each row's line.
+        self.views = replace(views, centre=views.centre - self.origin[self.line])
         events = evidence.event_forms[tracks.observation]
         A = camera_from_world_lines(frames, self.views.frame, self.origin[self.line])
         self.moment_form = np.swapaxes(A[:, 3:], -1, -2) @ A[:, 3:]
@@ -148,8 +149,7 @@ class _Problem:
     def residual_px(self, state: _State) -> FloatArray:
         """(S,) larger end residual of each observation, px."""
         v, m = state.plucker
-        local = Views(**(vars(self.views) | {"centre": self.centre}))
-        ends = end_residuals_px(local, v[self.line], m[self.line], self.focal_px)
+        ends = end_residuals_px(self.views, v[self.line], m[self.line], self.focal_px)
         return np.asarray(np.abs(ends).max(axis=-1))
 
     def inliers(self, residual_px: FloatArray, *, loose: bool) -> BoolArray:
@@ -199,9 +199,9 @@ class _Problem:
         v, m = state.plucker
         along = self._middles_m(state)[self.line]
         foot = plucker.nearest_to_origin(v, m)[self.line] + along[:, None] * v[self.line]
-        r = grassmann.plane_line_residual(self.views.normal, self.centre, v[self.line], foot)
+        r = grassmann.plane_line_residual(self.views.normal, self.views.centre, v[self.line], foot)
         by_line, _ = grassmann.plane_line_jacobians(
-            self.views.normal, self.centre, state.U[self.line], state.phi[self.line], along
+            self.views.normal, self.views.centre, state.U[self.line], state.phi[self.line], along
         )
         weighted = weight[:, None, None] * by_line
         return _System(
@@ -213,8 +213,7 @@ class _Problem:
     def _middles_m(self, state: _State) -> FloatArray:
         """(L,) mean arc length of the middles of the observed intervals that cut the line."""
         v, m = state.plucker
-        local = Views(**(vars(self.views) | {"centre": self.centre}))
-        cuts, _ = cuts_m(local, v[self.line], m[self.line])
+        cuts, _ = cuts_m(self.views, v[self.line], m[self.line])
         middles = cuts.mean(axis=-1)
         counts = self.total(np.isfinite(middles).astype(np.float64))
         return self.total(np.nan_to_num(middles)) / np.maximum(counts, 1.0)

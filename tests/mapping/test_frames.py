@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from roel_service.config.stages import DetectConfig, FramesConfig
 from roel_service.geometry import projection
+from roel_service.geometry.projection import undistortion_table
 from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.mapping.frames import (
     UNKNOWN_POLARITY,
@@ -16,7 +17,6 @@ from roel_service.mapping.frames import (
     frame_slices,
     frame_times,
     frames_at,
-    undistortion_table,
     window_event_counts,
     window_range,
 )
