@@ -1,0 +1,1 @@
+"""Benchmarks: presets, ablations, disturbances and peers on scenes with truth, in one run."""

@@ -1,0 +1,70 @@
+"""What a benchmark runs on: a recording, and as much truth as there is about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.arrays import FloatArray, frozen_array
+from roel_service.scene.camera import Camera
+from roel_service.scene.clouds import PointCloud, TriangleMesh
+from roel_service.scene.events import EventSource
+from roel_service.scene.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapTruth:
+    """True surfaces, and the points of them that an event camera can see.
+
+    Attributes:
+        mesh: surfaces.
+        edges: observable edge points; None where only the surfaces are known.
+    """
+
+    mesh: TriangleMesh
+    edges: PointCloud | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LineTruth:
+    """True line segments, not all of which need to have been seen.
+
+    Attributes:
+        segments: (L, 2, 3) m, world frame.
+    """
+
+    segments: FloatArray
+
+    def __post_init__(self) -> None:
+        segments = frozen_array(self.segments, np.float64, (None, 2, 3), "segments")
+        object.__setattr__(self, "segments", segments)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene:
+    """One recording of the benchmark.
+
+    Attributes:
+        name: as the benchmark's tables call it.
+        events: may be read more than once.
+        camera: calibration.
+        trajectory: true poses, or the publisher's; None for a recording without poses, of which
+            only the front end can run.
+        noisy_trajectory: poses as a visual odometry would give them; None where there are none.
+        truth: None where nothing is known but the events themselves.
+        is_tuning: whether parameters were chosen by looking at it; such scenes count in no mean.
+    """
+
+    name: str
+    events: EventSource
+    camera: Camera
+    trajectory: Trajectory | None
+    noisy_trajectory: Trajectory | None = None
+    truth: MapTruth | LineTruth | None = None
+    is_tuning: bool = False
+
+    @property
+    def sensor(self) -> str:
+        """Width and height, written WxH."""
+        return f"{self.camera.width}x{self.camera.height}"
