@@ -58,11 +58,26 @@ def evaluate_map(line_map: LineMap, mesh: TriangleMesh, edges: PointCloud) -> Ma
     """
     if len(line_map) == 0:
         raise NoAnswerError("map", "at least one line", "none", reason="TOO_FEW_LINES")
+    return evaluate_points(sample_lines(line_map), mesh, edges, line_count=len(line_map))
+
+
+def evaluate_points(
+    samples: FloatArray, mesh: TriangleMesh, edges: PointCloud, *, line_count: int = 0
+) -> MapEvaluation:
+    """Compare a map that is made of points with the truth, by the formulas for lines.
+
+    Args:
+        samples: (P, 3) m, at least one.
+        mesh, edges: the truth, in the same frame.
+        line_count: lines that the points stand for.
+
+    Raises:
+        MeshError, CloudError: no triangles, no edge points.
+    """
     if len(mesh) == 0:
         raise MeshError("mesh", "at least one triangle", "none")
     if len(edges) == 0:
         raise CloudError("edges", "at least one point", "none")
-    samples = sample_lines(line_map)
     truth = edges.points.astype(np.float64)
     surface_mm = 1e3 * distances_to_mesh(samples, mesh)
     sample_mm = 1e3 * _nearest_distances(samples, truth)
@@ -75,7 +90,7 @@ def evaluate_map(line_map: LineMap, mesh: TriangleMesh, edges: PointCloud) -> Ma
         iou_20=_iou(sample_mm, edge_mm, 20.0),
         precision_20=float((sample_mm <= 20.0).mean()),
         recall_20=float((edge_mm <= 20.0).mean()),
-        line_count=len(line_map),
+        line_count=line_count,
         sample_count=len(samples),
         edge_count=len(truth),
         accuracy_median_mm=float(np.median(surface_mm)),

@@ -2,7 +2,12 @@ import numpy as np
 import pytest
 
 from roel_service.errors import CloudError, MapFileError, MeshError, NoAnswerError
-from roel_service.evaluation.maps import distances_to_mesh, evaluate_map, sample_lines
+from roel_service.evaluation.maps import (
+    distances_to_mesh,
+    evaluate_map,
+    evaluate_points,
+    sample_lines,
+)
 from roel_service.scene.clouds import PointCloud, TriangleMesh
 from roel_service.scene.lines import LineMap
 
@@ -96,6 +101,16 @@ def test_counts_follow_the_formula():
     assert result.iou_20 == 101 / (201 + 202 - 105)
     assert result.precision_20 == 105 / 201
     assert result.recall_20 == 0.5
+
+
+def test_points_on_lines_score_as_the_lines_do():
+    line_map = lines([[0, 0, 0.007], [1, 0, 0.007]])
+    edges = edge_points([0, 0, 0], [1, 0, 0], 201)
+    points = sample_lines(line_map)
+    assert evaluate_points(points, SQUARE, edges, line_count=1) == evaluate_map(
+        line_map, SQUARE, edges
+    )
+    assert evaluate_points(points, SQUARE, edges).line_count == 0
 
 
 def test_ghost_moves_the_mean_and_not_the_median():
