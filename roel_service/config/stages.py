@@ -13,7 +13,7 @@ from typing import Any
 from roel_service.errors import ConfigError
 
 DETECTORS = ("edlines", "lsd")
-REPRESENTATIONS = ("binary", "timestamp", "count", "count_sum")
+REPRESENTATIONS = ("binary", "timestamp", "count", "count_sum", "tos", "sits")
 PLANE_FIT_METHODS = ("vote", "ransac")
 MATCH_GLOBAL_METHODS = ("reassociate", "sampled")
 TRIANGULATE_GATES = ("pixel", "grassmann")
@@ -113,7 +113,8 @@ class DetectConfig(Stage, table="detect"):
 
     Attributes:
         detector: 2D line detector.
-        representations: images made of every window; `timestamp` and `count` are one a polarity.
+        representations: images made of every window; `timestamp`, `count` and `sits` are one a
+            polarity, `tos` and `sits` the surfaces that the paper compares with.
         window_events_per_pixel: window sizes, in events for each pixel of the sensor.
         window_event_counts: window sizes in events; takes the place of the former if not empty.
         blur_px: standard deviation of the Gaussian that images are smoothed with.

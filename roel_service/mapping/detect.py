@@ -16,7 +16,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import DetectConfig
 from roel_service.mapping import detect_kernels
-from roel_service.mapping.frames import EventImage
+from roel_service.mapping.representations import EventImage
 
 # OpenCV's LSD at its default scale of 0.8 puts lines this far to the upper left (px).
 LSD_OFFSET_PX = -0.125

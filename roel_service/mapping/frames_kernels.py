@@ -1,9 +1,8 @@
-"""Loops over events: undistortion, rotation compensation, images."""
+"""Loop over events: undistortion and rotation compensation."""
 
 from __future__ import annotations
 
 import numba
-import numpy as np
 
 from roel_service.arrays import Array
 
@@ -37,46 +36,3 @@ def compensate(
         w = h[2, 0] * u + h[2, 1] * v + h[2, 2]
         compensated_px[k, 0] = (h[0, 0] * u + h[0, 1] * v + h[0, 2]) / w
         compensated_px[k, 1] = (h[1, 0] * u + h[1, 1] * v + h[1, 2]) / w
-
-
-@numba.njit(cache=True, nogil=True)
-def splat(xy_px: Array, polarity: Array, images: Array) -> None:
-    """Add each event to the image of its polarity, spread over four pixels.
-
-    Args:
-        xy_px: (K, 2) float32.
-        polarity: (K,) int8.
-        images: (2, H, W) float32, negative and positive; added to.
-    """
-    height, width = images.shape[1:]
-    for k in range(len(xy_px)):
-        # NaN fails the comparison, too.
-        if not (0.0 <= xy_px[k, 0] < width - 1 and 0.0 <= xy_px[k, 1] < height - 1):
-            continue
-        column = int(xy_px[k, 0])
-        row = int(xy_px[k, 1])
-        fx = xy_px[k, 0] - column
-        fy = xy_px[k, 1] - row
-        image = images[1 if polarity[k] > 0 else 0]
-        image[row, column] += (1 - fx) * (1 - fy)
-        image[row, column + 1] += fx * (1 - fy)
-        image[row + 1, column] += (1 - fx) * fy
-        image[row + 1, column + 1] += fx * fy
-
-
-@numba.njit(cache=True, nogil=True)
-def latest(xy_px: Array, polarity: Array, t_us: Array, images: Array) -> None:
-    """Write the time of the last event at each pixel, a polarity each.
-
-    Args:
-        xy_px: (K, 2) float32.
-        polarity: (K,) int8.
-        t_us: (K,) int64, non-decreasing.
-        images: (2, H, W) int64, negative and positive; untouched where no event fell.
-    """
-    height, width = images.shape[1:]
-    for k in range(len(xy_px)):
-        column = np.floor(xy_px[k, 0] + 0.5)
-        row = np.floor(xy_px[k, 1] + 0.5)
-        if 0 <= column < width and 0 <= row < height:
-            images[1 if polarity[k] > 0 else 0, int(row), int(column)] = t_us[k]

@@ -16,7 +16,6 @@ from roel_service.mapping.evidence import Evidence, measure_evidence
 from roel_service.mapping.frames import (
     Frames,
     event_frame,
-    event_images,
     frame_slices,
     frame_times,
     frames_at,
@@ -35,6 +34,7 @@ from roel_service.mapping.plane_fit import (
     observations_of_frames,
 )
 from roel_service.mapping.refine import Refined, refine_lines
+from roel_service.mapping.representations import event_images
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.trim import trim_to_segments

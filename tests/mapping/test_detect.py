@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from roel_service.config.stages import DetectConfig
 from roel_service.geometry import segments
 from roel_service.mapping.detect import LSD, EDLines, detect_lines, line_detector, merge_seeds
-from roel_service.mapping.frames import EventImage
+from roel_service.mapping.representations import EventImage
 
 from .synthetic import CAMERA
 

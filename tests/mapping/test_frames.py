@@ -1,4 +1,3 @@
-import dataclasses
 import itertools
 
 import numpy as np
@@ -11,20 +10,19 @@ from roel_service.geometry import projection
 from roel_service.geometry.projection import undistortion_table
 from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.mapping.frames import (
-    UNKNOWN_POLARITY,
     event_frame,
-    event_images,
     frame_slices,
     frame_times,
     frames_at,
     window_event_counts,
     window_range,
 )
+from roel_service.mapping.representations import event_images
 from roel_service.scene.camera import Camera, CameraModel
 from roel_service.scene.events import EventStream
 from roel_service.scene.trajectory import MAX_POSE_GAP_US, Trajectory
 
-from .synthetic import CAMERA, event_frame_of, trajectory
+from .synthetic import CAMERA, trajectory
 
 WINDOW = FramesConfig(min_half_window_us=10, max_half_window_us=100)
 
@@ -232,82 +230,6 @@ class TestRotationCompensation:
         frame, _ = self.compensated(np.empty(0, np.int64), slot_us=500)
         assert frame.compensated_px.shape == (0, 2)
         assert list(event_images(frame, DetectConfig())) == []
-
-
-def images_of(xy_px, t_us, polarity, blur_px=0.0, **changes):
-    frame = event_frame_of((np.array(xy_px, float), np.array(t_us), np.array(polarity)))
-    config = DetectConfig(blur_px=blur_px, **changes)
-    return list(event_images(frame, config))
-
-
-class TestImages:
-    XY_PX = ((10, 20), (30, 40), (10, 20), (50.4, 60.6))
-    T_US = (0, 1_000, 5_000, 10_000)
-    POLARITY = (1, -1, 1, -1)
-
-    def images(self, representation, **changes):
-        return images_of(
-            self.XY_PX, self.T_US, self.POLARITY, representations=(representation,), **changes
-        )
-
-    def test_binary_is_white_where_an_event_fell(self):
-        (image,) = self.images("binary")
-        assert image.polarity == UNKNOWN_POLARITY
-        assert sorted(zip(*np.nonzero(image.grey), strict=True)) == [(20, 10), (40, 30), (61, 50)]
-        assert set(np.unique(image.grey)) == {0, 255}
-
-    def test_timestamp_is_the_time_of_the_last_event_of_each_polarity(self):
-        negative, positive = self.images("timestamp")
-        assert (negative.polarity, positive.polarity) == (-1, 1)
-        # 255 (t - first) / (last - first), rounded; the second event at a pixel replaces the first.
-        assert negative.grey[40, 30] == round(255 * 0.1)
-        assert negative.grey[61, 50] == 255
-        assert positive.grey[20, 10] == round(255 * 0.5)
-        assert np.count_nonzero(negative.grey) == 2
-        assert np.count_nonzero(positive.grey) == 1
-
-    def test_timestamp_of_events_at_one_time_is_black(self):
-        images = images_of([(5, 5)] * 3, [7] * 3, [1] * 3, representations=("timestamp",))
-        assert [image.grey.max() for image in images] == [0, 0]
-
-    def test_count_tells_polarities_apart_and_count_sum_does_not(self):
-        negative, positive = self.images("count")
-        (both,) = self.images("count_sum")
-        assert (negative.polarity, positive.polarity, both.polarity) == (-1, 1, 0)
-        assert negative.grey[20, 10] == 0
-        assert positive.grey[40, 30] == 0
-        np.testing.assert_array_equal(both.grey > 0, (negative.grey > 0) | (positive.grey > 0))
-
-    def test_count_grows_with_events_and_saturates(self):
-        xy = [(10, 10)] * 1 + [(20, 20)] * 2 + [(30, 30)] * 3 + [(40, 40)] * 3
-        (image,) = images_of(xy, np.zeros(9, int), np.ones(9, int))
-        grey = [int(image.grey[p, p]) for p in (10, 20, 30)]
-        # The 75th percentile of 1, 2, 3, 3 is 3: 255 (1 - exp(-1.2 n / 3)).
-        assert grey == [round(255 * (1 - np.exp(-0.4 * n))) for n in (1, 2, 3)]
-
-    def test_an_event_between_pixels_is_shared_by_them(self):
-        (image,) = images_of([(10.5, 20.5)], [0], [1])
-        assert image.grey[20:22, 10:12].min() == image.grey.max() > 0
-        assert np.count_nonzero(image.grey) == 4
-
-    def test_every_window_and_representation_has_its_images(self):
-        frame = event_frame_of((np.full((20, 2), 30.0), np.arange(20), np.ones(20)))
-        frame = dataclasses.replace(frame, windows=((8, 12), (0, 20), (3, 3)))
-        config = DetectConfig(representations=("binary", "timestamp", "count_sum"))
-        # The third window is empty and has none.
-        assert len(list(event_images(frame, config))) == 2 * (1 + 2 + 1)
-
-    def test_blur_spreads_an_event(self):
-        (sharp,), (soft,) = self.images("binary"), self.images("binary", blur_px=1.0)
-        assert np.count_nonzero(soft.grey) > np.count_nonzero(sharp.grey)
-
-    @pytest.mark.parametrize("representation", ["binary", "timestamp", "count", "count_sum"])
-    @pytest.mark.parametrize("place", [(np.nan, np.nan), (-3.0, 5.0), (1e9, 5.0), (159.7, 119.7)])
-    def test_events_outside_the_image_are_left_out(self, representation, place):
-        frame = event_frame_of(([(5.0, 5.0)], np.zeros(1), np.ones(1)))
-        frame = dataclasses.replace(frame, compensated_px=np.array([place], np.float32))
-        config = DetectConfig(representations=(representation,), blur_px=0.0)
-        assert all(image.grey.max() == 0 for image in event_images(frame, config))
 
 
 class TestUndistortion:
