@@ -23,10 +23,10 @@ from roel_service.arrays import Array, BoolArray, FloatArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import grassmann, plucker
 from roel_service.geometry.vectors import dot
+from roel_service.mapping import refine_kernels
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.moments import camera_from_world_lines
-from roel_service.mapping.views import cuts_m, end_residuals_px
+from roel_service.mapping.views import cuts_m
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
 # Damping relative to the diagonal: start, and factors after a good and a bad step.
@@ -118,21 +118,18 @@ class _Problem:
         self.origin = self.mean(views.centre)
         # As seen about the origin of each row's line.
         self.views = replace(views, centre=views.centre - self.origin[self.line])
-        events = evidence.event_forms[tracks.observation]
-        A = camera_from_world_lines(frames, self.views.frame, self.origin[self.line])
-        self.moment_form = np.swapaxes(A[:, 3:], -1, -2) @ A[:, 3:]
-        self.event_count = np.minimum(
-            evidence.event_counts[tracks.observation], config.event_count_per_line or np.inf
-        )
+        self.observation = tracks.observation
+        self.evidence = evidence
+        self.rotation = frames.T_world_camera.rotation
         if config.residual == "pixel":
-            segments = evidence.segment_forms[tracks.observation]
-            forms = self.focal_px**2 * (segments + config.event_weight * events)
+            both = evidence.segment_forms + config.event_weight * evidence.event_forms
+            self.forms = self.focal_px**2 * both
             cap = config.max_length_weight_px
             self.weight = np.minimum(self.views.length_px, cap) / cap
         else:
-            forms = config.event_weight * self.event_count[:, None, None] * events
+            event_count = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
+            self.forms = config.event_weight * event_count[:, None, None] * evidence.event_forms
             self.weight = self.views.length_px
-        self.form = np.swapaxes(A, -1, -2) @ forms @ A
 
     def total(self, rows: FloatArray) -> FloatArray:
         """(L, ...) sums of (S, ...) rows over each line."""
@@ -149,8 +146,19 @@ class _Problem:
     def residual_px(self, state: _State) -> FloatArray:
         """(S,) larger end residual of each observation, px."""
         v, m = state.plucker
-        ends = end_residuals_px(self.views, v[self.line], m[self.line], self.focal_px)
-        return np.asarray(np.abs(ends).max(axis=-1))
+        views = self.evidence.views
+        return np.asarray(
+            refine_kernels.end_residuals(
+                self.offsets,
+                self.origin,
+                v,
+                m,
+                views.centre,
+                views.end_rays,
+                self.observation,
+                self.focal_px,
+            )
+        )
 
     def inliers(self, residual_px: FloatArray, *, loose: bool) -> BoolArray:
         """(S,) observations within the gate, which is wider in the first steps."""
@@ -162,6 +170,13 @@ class _Problem:
         if self.config.loss == "squared":
             return np.ones_like(residual_px)
         return np.asarray(1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2))
+
+    def cost(self, state: _State, weight: FloatArray) -> FloatArray:
+        """(L,) with fixed (S,) robust weights."""
+        if self.config.residual == "pixel":
+            return self._form_cost(state, weight * self.weight)
+        planes = self._plane_system(state, weight * self.weight)
+        return self._form_cost(state, weight) + planes.cost
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Cost, gradient and Gauss-Newton Hessian with fixed (S,) robust weights."""
@@ -175,24 +190,44 @@ class _Problem:
             hessian=events.hessian + planes.hessian,
         )
 
-    def _form_system(self, state: _State, weight: FloatArray) -> _System:
-        """Of sum w y^T G y / y^T N y, where y^T N y = |m_c|^2."""
+    def _form_cost(self, state: _State, weight: FloatArray) -> FloatArray:
+        """(L,) sum w y^T G y / |m_c|^2."""
         v, m = state.plucker
-        y = np.concatenate([v, m], axis=-1)
-        rows = y[self.line]
-        squared = dot(rows, np.einsum("sij,sj->si", self.moment_form, rows))
-        quotient = dot(rows, np.einsum("sij,sj->si", self.form, rows)) / squared
-        scaled = (weight / squared)[:, None, None]
-        forms = self.total(scaled * self.form)
-        # The quotient's own derivative: minus r^2 N.
-        pull = self.total(scaled * quotient[:, None, None] * self.moment_form)
-        dv, dm = plucker.plucker_jacobians(state.U, state.phi)
-        J = np.concatenate([dv, dm], axis=-2)
-        return _System(
-            cost=self.total(weight * quotient),
-            gradient=np.einsum("lij,li->lj", J, np.einsum("lij,lj->li", forms - pull, y)),
-            hessian=np.swapaxes(J, -1, -2) @ forms @ J,
+        views = self.evidence.views
+        return np.asarray(
+            refine_kernels.form_cost(
+                self.offsets,
+                self.origin,
+                v,
+                m,
+                self.rotation,
+                views.centre,
+                views.frame,
+                self.observation,
+                self.forms,
+                weight,
+            )
         )
+
+    def _form_system(self, state: _State, weight: FloatArray) -> _System:
+        """Of sum w y^T G y / |m_c|^2, y the line in the camera frame of each observation."""
+        v, m = state.plucker
+        dv, dm = plucker.plucker_jacobians(state.U, state.phi)
+        views = self.evidence.views
+        cost, gradient, hessian = refine_kernels.form_system(
+            self.offsets,
+            self.origin,
+            v,
+            m,
+            np.concatenate([dv, dm], axis=-2),
+            self.rotation,
+            views.centre,
+            views.frame,
+            self.observation,
+            self.forms,
+            weight,
+        )
+        return _System(cost=cost, gradient=gradient, hessian=hessian)
 
     def _plane_system(self, state: _State, weight: FloatArray) -> _System:
         """Of sum w |(n.v, d / sqrt(1 + d^2))|^2, taken at the middle of the observed interval."""
@@ -271,7 +306,7 @@ def _step(
     delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
     U, phi = plucker.retract_orthonormal(state.U, state.phi, delta)
     trial = _State(U=U, phi=phi)
-    better = problem.system(trial, weight).cost <= system.cost
+    better = problem.cost(trial, weight) <= system.cost
     return (
         _State(
             U=np.where(better[:, None, None], trial.U, state.U),
