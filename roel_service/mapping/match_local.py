@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import MatchLocalConfig
 from roel_service.geometry import segments
-from roel_service.mapping.frames import UNKNOWN_POLARITY, Frames
+from roel_service.mapping import match_local_kernels
+from roel_service.mapping.frames import Frames
 from roel_service.scene.lines import LineObservations, LineTracks
 
 
@@ -57,45 +58,32 @@ def _mutual_nearest(
     """Pairs of observations that are each other's nearest and pass the gates."""
     if len(before) == 0 or len(after) == 0:
         return before[:0], after[:0]
-    cost = _cost(before, after, observations, frames, config, rotation_is_undone)
-    nearest_after = cost.argmin(axis=1)
-    nearest_before = cost.argmin(axis=0)
-    mutual = nearest_before[nearest_after] == np.arange(len(before))
-    mutual &= cost[np.arange(len(before)), nearest_after] < config.max_distance_px
-    return before[mutual], after[nearest_after[mutual]]
-
-
-def _cost(
-    before: IntArray,
-    after: IntArray,
-    observations: LineObservations,
-    frames: Frames,
-    config: MatchLocalConfig,
-    rotation_is_undone: bool,
-) -> FloatArray:
-    """(B, A) distances in px, infinite where polarity or overlap forbid the pair."""
-    lines_before = observations.segments_px[before][:, None]
-    lines_after = observations.segments_px[after][None]
+    lines_before, lines_after = observations.segments_px[before], observations.segments_px[after]
+    frames_before, group = np.unique(observations.frame[before], return_inverse=True)
+    moved, returned = lines_before, np.repeat(lines_after[None], len(frames_before), axis=0)
     if config.predict:
-
-        def moved_to(frame: Array, indices: IntArray) -> FloatArray:
-            return predict(
-                indices, frame, observations, frames, rotation_is_undone=rotation_is_undone
-            )
-
-        moved = moved_to(observations.frame[after[:1]], before)[:, None]
-        returned = np.empty((len(before), len(after), 2, 2))
-        for frame in np.unique(observations.frame[before]):
-            rows = observations.frame[before] == frame
-            returned[rows] = moved_to(np.array([frame]), after)
-        cost = 0.5 * (_one_way(moved, lines_after) + _one_way(returned, lines_before))
-        facing = facing_share(moved, lines_after)
-    else:
-        cost = segments.perpendicular(lines_before, lines_after)
-        facing = facing_share(lines_before, lines_after)
-    allowed = _same_polarity(observations.polarity[before], observations.polarity[after])
-    allowed &= (facing >= config.min_overlap) & (facing > 0)
-    return np.where(allowed, cost, np.inf)
+        there = observations.frame[after[:1]]
+        moved = predict(before, there, observations, frames, rotation_is_undone=rotation_is_undone)
+        returned = np.stack(
+            [
+                predict(after, back, observations, frames, rotation_is_undone=rotation_is_undone)
+                for back in frames_before[:, None]
+            ]
+        )
+    of_before, of_after = match_local_kernels.nearest(
+        moved,
+        returned,
+        group,
+        lines_before,
+        lines_after,
+        observations.polarity[before],
+        observations.polarity[after],
+        not config.predict,
+        config.max_distance_px,
+        config.min_overlap,
+    )
+    mutual = (of_before >= 0) & (of_after[of_before] == np.arange(len(before)))
+    return before[mutual], after[of_before[mutual]]
 
 
 def predict(
@@ -124,20 +112,3 @@ def predict(
     H = frames.K @ R_to_own @ np.linalg.inv(frames.K)
     homogeneous = moved @ np.swapaxes(H[:, :, :2], -1, -2) + H[:, None, :, 2]
     return np.asarray(homogeneous[..., :2] / homogeneous[..., 2:])
-
-
-def _one_way(moved: FloatArray, others: FloatArray) -> FloatArray:
-    """(*B,) mean of the larger and the average distance of the ends to the other line, px."""
-    ends = np.abs(segments.point_line_offset(moved, others[..., None, :, :]))
-    return np.asarray(0.5 * ends.max(axis=-1) + 0.5 * ends.mean(axis=-1))
-
-
-def facing_share(moved: FloatArray, others: FloatArray) -> FloatArray:
-    """(*B,) length over which two segments face each other, as a share of the shorter one."""
-    shorter = np.minimum(segments.length(moved), segments.length(others))
-    return segments.overlap(moved, others) * segments.length(others) / shorter
-
-
-def _same_polarity(before: Array, after: Array) -> BoolArray:
-    unknown = (before[:, None] == UNKNOWN_POLARITY) | (after[None] == UNKNOWN_POLARITY)
-    return np.asarray(unknown | (before[:, None] == after[None]))

@@ -5,7 +5,8 @@ import pytest
 
 from roel_service.config.stages import MatchLocalConfig
 from roel_service.geometry import projection, segments
-from roel_service.mapping.match_local import facing_share, match_adjacent_frames, predict
+from roel_service.mapping.match_local import match_adjacent_frames, predict
+from roel_service.mapping.match_local_kernels import facing_share
 
 from .synthetic import observed, still_frames, world
 
