@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_bench.scenes import Scene
-from roel_service.arrays import BoolArray
+from roel_bench.scenes import Scene, part_of
 from roel_service.errors import InputError
 from roel_service.scene.events import EventSource, EventStream
 from roel_service.scene.trajectory import Trajectory
@@ -103,7 +102,7 @@ def with_uneven_thresholds(scene: Scene, seed: int) -> Scene:
 
     def thin(chunk: EventStream, rng: np.random.Generator) -> EventStream:
         kept_share = 1.0 / ratio[(chunk.polarity > 0).astype(np.intp), chunk.y, chunk.x]
-        return _part(chunk, rng.random(len(chunk)) < kept_share)
+        return part_of(chunk, rng.random(len(chunk)) < kept_share)
 
     return _with_events(scene, thin, seed)
 
@@ -112,7 +111,7 @@ def with_low_light(scene: Scene, seed: int) -> Scene:
     """Only `LOW_LIGHT_SHARE` of the events, drawn at random."""
 
     def thin(chunk: EventStream, rng: np.random.Generator) -> EventStream:
-        return _part(chunk, rng.random(len(chunk)) < LOW_LIGHT_SHARE)
+        return part_of(chunk, rng.random(len(chunk)) < LOW_LIGHT_SHARE)
 
     return _with_events(scene, thin, seed)
 
@@ -162,16 +161,6 @@ DISTURBANCES: dict[str, Disturbance] = {
 def _with_events(scene: Scene, change: Change, seed: int) -> Scene:
     events = ChangedEvents(source=scene.events, change=change, seed=seed)
     return dataclasses.replace(scene, events=events)
-
-
-def _part(chunk: EventStream, kept: BoolArray) -> EventStream:
-    return dataclasses.replace(
-        chunk,
-        t_us=chunk.t_us[kept],
-        x=chunk.x[kept],
-        y=chunk.y[kept],
-        polarity=chunk.polarity[kept],
-    )
 
 
 def _count_and_duration_us(events: EventSource) -> tuple[int, int]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import FloatArray, frozen_array
+from roel_service.arrays import BoolArray, FloatArray, frozen_array
 from roel_service.scene.camera import Camera
 from roel_service.scene.clouds import PointCloud, TriangleMesh
-from roel_service.scene.events import EventSource
+from roel_service.scene.events import EventSource, EventStream
 from roel_service.scene.trajectory import Trajectory
 
 
@@ -41,6 +42,31 @@ class LineTruth:
         object.__setattr__(self, "segments", segments)
 
 
+def part_of(events: EventStream, kept: BoolArray) -> EventStream:
+    """The events of a (K,) mask."""
+    return dataclasses.replace(
+        events,
+        t_us=events.t_us[kept],
+        x=events.x[kept],
+        y=events.y[kept],
+        polarity=events.polarity[kept],
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HeldBackEvents:
+    """Events that the map is not built from and ought to explain.
+
+    Attributes:
+        events: on the clock of the scene's poses.
+    """
+
+    events: EventStream
+
+
+Truth = MapTruth | LineTruth | HeldBackEvents
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
     """One recording of the benchmark.
@@ -52,7 +78,7 @@ class Scene:
         trajectory: true poses, or the publisher's; None for a recording without poses, of which
             only the front end can run.
         noisy_trajectory: poses as a visual odometry would give them; None where there are none.
-        truth: None where nothing is known but the events themselves.
+        truth: None where nothing is known.
         is_tuning: whether parameters were chosen by looking at it; such scenes count in no mean.
     """
 
@@ -61,7 +87,7 @@ class Scene:
     camera: Camera
     trajectory: Trajectory | None
     noisy_trajectory: Trajectory | None = None
-    truth: MapTruth | LineTruth | None = None
+    truth: Truth | None = None
     is_tuning: bool = False
 
     @property

@@ -1,0 +1,183 @@
+"""The scenes of the benchmark by name, and which of them parameters may be chosen on.
+
+| name | what |
+| --- | --- |
+| `sim_SEED_WxH_SECONDSs` | simulated room, made once and kept |
+| `room_11`, `room_12` | rooms of another simulator, in the folder of recordings |
+| `slider_depth`, `events_room01` | real events with poses; events of a photographed room |
+| `boxes`, `disk`, `stripes`, `building` | real events without poses |
+| `folder:PATH` | any recording laid out as `roel simulate` does |
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from roel_bench.recordings import read_aedat2, read_event_lifetime
+from roel_bench.scenes import HeldBackEvents, LineTruth, MapTruth, Scene, part_of
+from roel_service.errors import InputError
+from roel_service.io.camera import read_camera
+from roel_service.io.clouds import read_mesh, read_points
+from roel_service.io.events import open_events, read_events
+from roel_service.io.npz import read_npz
+from roel_service.io.poses import read_trajectory
+from roel_service.progress import ProgressCallback
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventStream
+from roel_service.simulate.dataset import SimulationConfig, simulate_dataset
+
+# Parameters were chosen by looking at these, so their rows count in no mean.
+TUNING_ROOMS = ("room_11", "room_12")
+TUNING_SEEDS = range(101, 110)
+
+LARGE_ROOMS = tuple(f"sim_{seed}_640x480_8s" for seed in range(201, 205))
+SMALL_ROOMS = tuple(f"sim_{seed}_346x260_6s" for seed in range(211, 215))
+REPORTING_ROOMS = LARGE_ROOMS + SMALL_ROOMS
+POSED_RECORDINGS = ("slider_depth", "events_room01")
+POSELESS_RECORDINGS = ("boxes", "disk", "stripes", "building")
+# Small enough for a test, large enough for some lines.
+TINY_ROOM = "sim_1_173x130_1s"
+
+SIMULATED_NAME = re.compile(
+    r"sim_(?P<seed>\d{1,9})_(?P<width>\d{2,4})x(?P<height>\d{2,4})_(?P<seconds>\d{1,3}(\.\d)?)s"
+)
+# Every so many events one is held back where there is no other truth.
+HELD_BACK_STRIDE = 10
+DAVIS240_SIZE = (240, 180)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Places:
+    """Where scenes are found.
+
+    Attributes:
+        data: folder of recordings, or None where there is none.
+        rooms: folder that keeps simulated rooms; made when the first one is.
+    """
+
+    data: Path | None
+    rooms: Path
+
+
+def open_scene(name: str, places: Places, progress: ProgressCallback) -> Scene:
+    """The scene of that name, simulated first if need be.
+
+    Raises:
+        InputError: no scene of that name, a folder that is not there, or files of it that cannot
+            be used.
+    """
+    if simulated := SIMULATED_NAME.fullmatch(name):
+        return _simulated(name, simulated, places.rooms, progress)
+    if name.startswith("folder:"):
+        return _folder(name, Path(name.removeprefix("folder:")), is_tuning=False)
+    if name not in RECORDINGS:
+        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH"])
+        raise InputError("scene", f"one of {known}", name)
+    if places.data is None:
+        raise InputError(name, "a folder of recordings (--data or ROEL_DATA)", "none")
+    return RECORDINGS[name](name, places.data)
+
+
+def _simulated(
+    name: str, arguments: re.Match[str], rooms: Path, progress: ProgressCallback
+) -> Scene:
+    folder = rooms / name
+    seed = int(arguments["seed"])
+    if not folder.exists():
+        rooms.mkdir(parents=True, exist_ok=True)
+        config = SimulationConfig(
+            seconds=float(arguments["seconds"]),
+            width=int(arguments["width"]),
+            height=int(arguments["height"]),
+            panorama_count=0,
+        )
+        simulate_dataset(folder, config, seed, progress)
+    return _folder(name, folder, is_tuning=seed in TUNING_SEEDS)
+
+
+def _folder(name: str, folder: Path, *, is_tuning: bool) -> Scene:
+    """A recording laid out as `roel simulate` does; truth and noisy poses may be missing."""
+    camera = read_camera(folder / "camera.json")
+    noisy, truth = folder / "poses_noisy.txt", folder / "gt.npz"
+    return Scene(
+        name=name,
+        events=open_events(folder / "events.h5", camera.width, camera.height),
+        camera=camera,
+        trajectory=read_trajectory(folder / "poses.txt"),
+        noisy_trajectory=read_trajectory(noisy) if noisy.exists() else None,
+        truth=MapTruth(mesh=read_mesh(truth), edges=read_points(truth, "edges"))
+        if truth.exists()
+        else None,
+        is_tuning=is_tuning,
+    )
+
+
+def _room(name: str, data: Path) -> Scene:
+    return _folder(name, data / "rooms" / name, is_tuning=name in TUNING_ROOMS)
+
+
+def _photographed_room(name: str, data: Path) -> Scene:
+    folder = data / "real" / "zind" / name
+    lines = folder / "lines.npz"
+    segments = read_npz(lines, ("segments",), str(lines), InputError).get("segments")
+    if segments is None or segments.shape[1:] != (2, 3):
+        raise InputError(str(lines), "an array segments of shape (L, 2, 3)", "none of that shape")
+    scene = _folder(name, folder, is_tuning=False)
+    return Scene(
+        name=name,
+        events=scene.events,
+        camera=scene.camera,
+        trajectory=scene.trajectory,
+        truth=LineTruth(segments=segments),
+    )
+
+
+def _slider(name: str, data: Path) -> Scene:
+    """Real events with the poses of a linear slider; every tenth event is held back."""
+    folder = data / "real" / "davis_slider_depth"
+    events = read_events(folder / "events_chunk.txt", *DAVIS240_SIZE)
+    is_held_back = np.arange(len(events)) % HELD_BACK_STRIDE == HELD_BACK_STRIDE - 1
+    return Scene(
+        name=name,
+        events=part_of(events, ~is_held_back),
+        camera=read_camera(folder / "calib.txt", DAVIS240_SIZE),
+        trajectory=read_trajectory(folder / "groundtruth.txt"),
+        truth=HeldBackEvents(events=part_of(events, is_held_back)),
+    )
+
+
+def _poseless(folder: str, file: str, read: Callable[[Path], EventStream]) -> RecordingOpener:
+    """Opens a recording without poses; its calibration is unknown, and nothing asks for it."""
+
+    def opened(name: str, data: Path) -> Scene:
+        events = read(data / "real" / folder / file)
+        camera = Camera(
+            width=events.width,
+            height=events.height,
+            fx_px=float(events.width),
+            fy_px=float(events.width),
+            cx_px=(events.width - 1) / 2,
+            cy_px=(events.height - 1) / 2,
+        )
+        return Scene(name=name, events=events, camera=camera, trajectory=None)
+
+    return opened
+
+
+RecordingOpener = Callable[[str, Path], Scene]
+
+RECORDINGS: dict[str, RecordingOpener] = {
+    "room_11": _room,
+    "room_12": _room,
+    "slider_depth": _slider,
+    "events_room01": _photographed_room,
+    "boxes": _poseless("davis240_aedat2", "IMU_translBoxes.aedat", read_aedat2),
+    "disk": _poseless("davis240_aedat2", "IMU_rotDisk.aedat", read_aedat2),
+    "stripes": _poseless("rpg_event_lifetime", "stripes.mat", read_event_lifetime),
+    "building": _poseless("rpg_event_lifetime", "building.mat", read_event_lifetime),
+}
