@@ -14,6 +14,7 @@ import numpy as np
 
 from roel_bench.creases import crease_segments, offsets_px
 from roel_bench.heatmaps import PixelMatches, draw_lines, match_distance_px, match_pixels
+from roel_bench.results import Figures
 from roel_bench.scenes import MapTruth, Scene
 from roel_bench.visible_edges import VisibleEdges
 from roel_service.arrays import BoolArray, FloatArray
@@ -40,8 +41,6 @@ SPEED_INTERVAL_US = 5_000
 EXPLAINED_PX = 2.0
 # Events of a frame that are asked whether a line explains them.
 ASKED_EVENT_COUNT = 2_000
-
-Figures = dict[str, float | int | None]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -136,6 +135,7 @@ class FrameScores:
     def __init__(self) -> None:
         self.frame_count = 0
         self.line_count = 0
+        self.event_count = 0
         self.seconds = {"detect": 0.0, "plane_fit": 0.0}
         self._explained: list[float] = []
         self._matches: list[PixelMatches] = []
@@ -147,6 +147,7 @@ class FrameScores:
     def add(self, found: FrameLines) -> None:
         """Count the lines of one frame."""
         self.frame_count += 1
+        self.event_count += len(found.frame.events)
         self.line_count += len(found.lines.segments_px)
         self.seconds["detect"] += found.detect_s
         self.seconds["plane_fit"] += found.plane_fit_s

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from roel_service.config.load import Tables, with_tables
 from roel_service.config.presets import PRESETS, UNLIMITED, preset
@@ -30,12 +31,12 @@ class Variant:
         return with_tables(preset(self.preset), self.changes, subject=self.name)
 
 
-def _without(what: str, **changes: dict[str, object]) -> Variant:
+def _without(what: str, **changes: dict[str, Any]) -> Variant:
     """The default with one thing switched off."""
     return Variant(name=f"default without {what}", changes=changes)
 
 
-def _paper(name: str, **changes: dict[str, object]) -> Variant:
+def _paper(name: str, **changes: dict[str, Any]) -> Variant:
     """The paper's pipeline with something changed."""
     return Variant(name=f"paper: {name}", preset="paper", changes=changes)
 
@@ -95,7 +96,7 @@ WINDOWS = {"small": 0.1, "large": 0.3}
 REPRESENTATIONS = ("binary", "timestamp")
 
 
-def _single(window: str, representation: str) -> dict[str, object]:
+def _single(window: str, representation: str) -> dict[str, Any]:
     """Detection on one image instead of several; no merging is needed."""
     return {
         "window_events_per_pixel": [WINDOWS[window]],

@@ -1,0 +1,118 @@
+"""Which methods run on which scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from roel_bench.catalogue import (
+    LARGE_ROOMS,
+    POSED_RECORDINGS,
+    POSELESS_RECORDINGS,
+    REPORTING_ROOMS,
+    SMALL_ROOMS,
+    TINY_ROOM,
+    TUNING_ROOMS,
+)
+from roel_bench.disturbances import DISTURBANCES
+from roel_bench.methods import PEERS
+from roel_bench.results import NO_DISTURBANCE
+from roel_bench.variants import FRONT_END_VARIANTS, MAP_ABLATION, PRESET_VARIANTS, Variant
+from roel_service.errors import InputError
+
+MAP, FRONT_END = "map", "front_end"
+
+# The tables of single frames have many rows, and the paper's are of one scene.
+FRONT_END_ROOMS = LARGE_ROOMS[:2] + SMALL_ROOMS[:2]
+PRESET_NAMES = tuple(variant.name for variant in PRESET_VARIANTS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One run: a task on a disturbed scene by a method."""
+
+    task: str
+    scene: str
+    method: str
+    disturbance: str = NO_DISTURBANCE
+
+
+def _cells(
+    task: str, scenes: Iterable[str], methods: Iterable[str], disturbance: str = NO_DISTURBANCE
+) -> list[Cell]:
+    methods = list(methods)
+    return [
+        Cell(task=task, scene=scene, method=method, disturbance=disturbance)
+        for scene in scenes
+        for method in methods
+    ]
+
+
+def _names(variants: Iterable[Variant]) -> list[str]:
+    return [variant.name for variant in variants]
+
+
+PRESETS_SUITE = [
+    *_cells(MAP, TUNING_ROOMS + REPORTING_ROOMS + POSED_RECORDINGS, PRESET_NAMES),
+    *_cells(FRONT_END, POSELESS_RECORDINGS, PRESET_NAMES),
+]
+ABLATION_SUITE = _cells(MAP, REPORTING_ROOMS, ["default", "paper", *_names(MAP_ABLATION)])
+NOISE_SUITE = [
+    *_cells(MAP, REPORTING_ROOMS, ["default"]),
+    *(cell for name in DISTURBANCES for cell in _cells(MAP, REPORTING_ROOMS, ["default"], name)),
+]
+FRONT_END_SUITE = _cells(FRONT_END, FRONT_END_ROOMS, _names(FRONT_END_VARIANTS))
+PEERS_SUITE = _cells(MAP, TUNING_ROOMS + REPORTING_ROOMS, ["default", *PEERS])
+QUICK_SUITE = [
+    *_cells(MAP, [TINY_ROOM], PRESET_NAMES),
+    *_cells(MAP, [TINY_ROOM], ["default"], "noise_events"),
+    *_cells(FRONT_END, [TINY_ROOM], ["default", "paper"]),
+]
+
+SUITES = {
+    "quick": QUICK_SUITE,
+    "presets": PRESETS_SUITE,
+    "ablation": ABLATION_SUITE,
+    "noise": NOISE_SUITE,
+    "front-end": FRONT_END_SUITE,
+    "peers": PEERS_SUITE,
+    "full": [
+        *PRESETS_SUITE,
+        *NOISE_SUITE,
+        *PEERS_SUITE,
+        *FRONT_END_SUITE,
+        *ABLATION_SUITE,
+    ],
+}
+
+
+def select(
+    suite: str, scenes: tuple[str, ...] | None = None, methods: tuple[str, ...] | None = None
+) -> list[Cell]:
+    """The cells of a suite, each once and scene by scene; on other scenes, or with some methods.
+
+    Args:
+        suite: one of `SUITES`.
+        scenes: take the place of the suite's own.
+        methods: of the suite's methods, only these; where the suite has none of them, maps of
+            these.
+
+    Raises:
+        InputError: no suite of that name.
+    """
+    if suite not in SUITES:
+        raise InputError("suite", "one of " + ", ".join(SUITES), suite)
+    cells = list(dict.fromkeys(SUITES[suite]))
+    if methods is not None:
+        chosen = [cell for cell in cells if cell.method in methods]
+        own = dict.fromkeys(cell.scene for cell in cells)
+        cells = chosen or _cells(MAP, own, methods)
+    if scenes is not None:
+        pairs = dict.fromkeys((cell.task, cell.method, cell.disturbance) for cell in cells)
+        return [
+            Cell(task=task, scene=scene, method=method, disturbance=disturbance)
+            for scene in scenes
+            for task, method, disturbance in pairs
+        ]
+    order = {scene: index for index, scene in enumerate(dict.fromkeys(c.scene for c in cells))}
+    return sorted(cells, key=lambda cell: order[cell.scene])
