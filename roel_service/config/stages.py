@@ -16,6 +16,7 @@ DETECTORS = ("edlines", "lsd")
 REPRESENTATIONS = ("binary", "timestamp", "count", "count_sum", "tos", "sits")
 PLANE_FIT_METHODS = ("vote", "ransac")
 MATCH_GLOBAL_METHODS = ("reassociate", "sampled")
+MATCHERS = ("geometric", "xfeat", "aliked", "disk", "loftr")
 TRIANGULATE_GATES = ("pixel", "grassmann")
 REFINE_RESIDUALS = ("pixel", "grassmann")
 REFINE_LOSSES = ("cauchy", "squared")
@@ -35,6 +36,7 @@ NOT_NEGATIVE = Rule(">= 0", lambda value: value >= 0)
 SHARE = Rule("in [0, 1]", lambda value: 0 <= value <= 1)
 AT_LEAST_TWO = Rule(">= 2", lambda value: value >= 2)
 ALL_POSITIVE = Rule("positive values", lambda values: all(value > 0 for value in values))
+PRINTABLE = Rule("printable text", lambda value: isinstance(value, str) and value.isprintable())
 SOME_POSITIVE = Rule(
     "at least one value, all positive",
     lambda values: len(values) > 0 and all(value > 0 for value in values),
@@ -206,6 +208,11 @@ class MatchGlobalConfig(Stage, table="match_global"):
             `reassociate` projects triangulated lines into every frame, in rounds.
         frame_stride, neighbor_count: every how many frames, and against how many others, nearest
             by camera centre (`sampled`).
+        matcher: finds correspondences (`sampled`): `geometric` by projecting provisional lines, the
+            others by learned point matches between event images (extra `learned`).
+        checkpoint: file with the weights of `loftr`; empty for none.
+        min_point_match_count, point_distance_px: two lines correspond when so many point matches
+            lie this close to both (learned matchers).
         min_epipolar_score: epipolar intersection over union of a correspondence (`sampled`).
         max_distances_px: distance of an observation from the projected line, one value a round;
             the first one serves `sampled`.
@@ -217,11 +224,20 @@ class MatchGlobalConfig(Stage, table="match_global"):
     method: str = parameter("reassociate", one_of(MATCH_GLOBAL_METHODS))
     frame_stride: int = parameter(5, POSITIVE)
     neighbor_count: int = parameter(20, POSITIVE)
+    matcher: str = parameter("geometric", one_of(MATCHERS))
+    checkpoint: str = parameter("", PRINTABLE)
+    min_point_match_count: int = parameter(11, POSITIVE)
+    point_distance_px: float = parameter(10.0, POSITIVE)
     min_epipolar_score: float = parameter(0.3, SHARE)
     max_distances_px: tuple[float, ...] = parameter((1.5, 1.3, 1.1), SOME_POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
     max_shared_fraction: float = parameter(0.9, SHARE)
+
+    @property
+    def matches_points(self) -> bool:
+        """Whether correspondences come from point matches, which need the event images."""
+        return self.method == "sampled" and self.matcher != "geometric"
 
 
 @dataclass(frozen=True, kw_only=True)

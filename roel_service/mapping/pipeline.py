@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from roel_service.arrays import Array
 from roel_service.config.stages import Config
 from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
@@ -22,6 +23,7 @@ from roel_service.mapping.frames import (
 )
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
+from roel_service.mapping.match_points import PointLineMatcher, images_to_match, point_matcher
 from roel_service.mapping.match_sampled import (
     GeometricMatcher,
     LineMatcher,
@@ -64,10 +66,12 @@ def build_line_map(
         camera: calibration of the sensor.
         config: parameters of every stage, and the seed.
         detector: takes the place of the configured one.
-        matcher: finds correspondences for `match_global.method = "sampled"`; geometric by default.
+        matcher: finds correspondences for `match_global.method = "sampled"`; takes the place of
+            the configured one.
         progress: called often; may raise `Cancelled`.
 
     Raises:
+        ConfigError: the configured matcher lacks its extra or its checkpoint.
         EventsError: no events.
         TrajectoryError: poses that cover less than a tenth of the recording.
         Cancelled: as raised by `progress`.
@@ -76,8 +80,12 @@ def build_line_map(
     rng = np.random.default_rng(config.runtime.seed)
     counted = CountedEvents(events, trajectory)
     detector = detector or line_detector(config.detect)
+    needs_points = matcher is None and config.match_global.matches_points
+    points = point_matcher(config.match_global) if needs_points else None
 
-    frames, observations = _lines_of_all_frames(counted, trajectory, camera, config, detector, run)
+    frames, observations, images = _lines_of_all_frames(
+        counted, trajectory, camera, config, detector, run
+    )
     counted.check_coverage()
     with run.stage("match_local"):
         tracks = match_adjacent_frames(
@@ -89,7 +97,11 @@ def build_line_map(
         evidence = measure_evidence(observations, frames, trajectory, config.frames, config.refine)
     if config.match_global.method == "sampled":
         with run.stage("match_global"):
-            matcher = matcher or GeometricMatcher(tracks, evidence.views, frames, config)
+            matcher = matcher or (
+                PointLineMatcher(points, images, evidence.views, config.match_global)
+                if points
+                else GeometricMatcher(tracks, evidence.views, frames, config)
+            )
             tracks = match_sampled_frames(tracks, evidence.views, frames, config, matcher, run.step)
     with run.stage("triangulate"):
         refined = _triangulate(tracks, evidence, frames, config, rng, run)
@@ -148,8 +160,12 @@ def _lines_of_all_frames(
     config: Config,
     detector: LineDetector,
     run: MappingRun,
-) -> tuple[Frames, LineObservations]:
-    """Detection and plane fit of every frame; frames are independent and run in threads."""
+) -> tuple[Frames, LineObservations, dict[int, tuple[Array, ...]]]:
+    """Detection and plane fit of every frame; frames are independent and run in threads.
+
+    Returns:
+        the frames, their lines, and the images of sampled frames where point matches need them.
+    """
     ideal_px = undistortion_table(camera)
 
     def lines_of_frame(item: tuple[int, tuple[int, EventStream]]) -> _FrameLines:
@@ -159,12 +175,14 @@ def _lines_of_all_frames(
             stream, t_us, ideal_px, trajectory, camera, config.frames, config.detect
         )
         seeds = detect_lines(event_images(frame, config.detect), detector, config.detect)
+        images = images_to_match(index, frame, config)
         detected = time.perf_counter()
         rng = np.random.default_rng(np.random.SeedSequence(config.runtime.seed, spawn_key=(index,)))
         fitted = fit_space_time_planes(seeds, frame, config.plane_fit, rng)
         return _FrameLines(
             t_us=t_us,
             fitted=fitted,
+            images=images,
             detect_s=detected - started,
             plane_fit_s=time.perf_counter() - detected,
         )
@@ -186,12 +204,14 @@ def _lines_of_all_frames(
         },
     )
     frames = frames_at(np.array([lines.t_us for lines in done], np.int64), trajectory, camera)
-    return frames, observations_of_frames([lines.fitted for lines in done])
+    images = {index: lines.images for index, lines in enumerate(done)}
+    return frames, observations_of_frames([lines.fitted for lines in done]), images
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _FrameLines:
     t_us: int
     fitted: FittedLines
+    images: tuple[Array, ...]
     detect_s: float
     plane_fit_s: float

@@ -10,6 +10,7 @@ from roel_service.config.presets import PRESETS, preset
 from roel_service.config.stages import (
     DETECTORS,
     MATCH_GLOBAL_METHODS,
+    MATCHERS,
     PLANE_FIT_METHODS,
     REFINE_LOSSES,
     REFINE_RESIDUALS,
@@ -24,6 +25,7 @@ CHOICES = {
     "detect.detector": DETECTORS,
     "plane_fit.method": PLANE_FIT_METHODS,
     "match_global.method": MATCH_GLOBAL_METHODS,
+    "match_global.matcher": MATCHERS,
     "triangulate.gate": TRIANGULATE_GATES,
     "refine.residual": REFINE_RESIDUALS,
     "refine.loss": REFINE_LOSSES,
@@ -39,6 +41,8 @@ def values_of(path, value):
         return st.lists(st.sampled_from(REPRESENTATIONS), min_size=1).map(tuple)
     if path == "detect.window_event_counts":
         return st.lists(st.integers(1, 10**6)).map(tuple)
+    if path == "match_global.checkpoint":
+        return st.text().filter(str.isprintable)
     if isinstance(value, bool):
         return st.booleans()
     if isinstance(value, tuple):

@@ -44,7 +44,7 @@ class TestRanges:
     def test_a_value_out_of_range_is_refused_by_its_path(self, table, name):
         value = default(table, name)
         if isinstance(value, str):
-            wrong = "nonsense"
+            wrong = "non\nsense"
         elif isinstance(value, tuple):
             wrong = ("nonsense",) if name == "representations" else (-1,)
         else:
