@@ -5,8 +5,9 @@ PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 WEIGHTS := .venv/.weights
+LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current no-large-files format proto bench serve
+.PHONY: demo learned test check stubs-are-current no-large-files format proto bench limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -33,6 +34,8 @@ proto: $(INSTALLED)  ## write the committed stubs of proto/ anew
 
 bench: $(INSTALLED)  ## seconds and figures of each stage on simulated rooms
 	$(BIN)/python bench/rooms.py
+
+limap: $(LIMAP_INSTALLED)  ## the benchmark's peer LIMAP, by itself: its OpenCV would overwrite ours
 
 serve: $(INSTALLED)
 	$(BIN)/roel serve --data $(or $(DATA),.roel-data)
@@ -61,4 +64,9 @@ $(INSTALLED): pyproject.toml .ci/system_libraries
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "Installing into .venv; the first time takes some minutes."
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	@touch $@
+
+$(LIMAP_INSTALLED): Makefile
+	test -x .venv-limap/bin/python || $(PYTHON) -m venv .venv-limap
+	.venv-limap/bin/python -m pip install --quiet --disable-pip-version-check pylimap==2.0.0
 	@touch $@
