@@ -22,7 +22,10 @@ UNLIMITED = 1e6
 PAPER = Config(
     frames=FramesConfig(compensate_rotation=False),
     detect=DetectConfig(
-        representations=("binary", "timestamp"), merge_distance_px=2.0, merge_overlap=0.0
+        representations=("binary", "timestamp"),
+        merge_distance_px=2.0,
+        merge_overlap=0.0,
+        merge_across_polarities=True,
     ),
     plane_fit=PlaneFitConfig(
         method="ransac",
@@ -42,6 +45,7 @@ PAPER = Config(
         loss="squared",
         event_weight=1e4,
         event_count_per_line=50,
+        max_length_weight_px=UNLIMITED,
         max_residual_px=20.0,
     ),
     trim=TrimConfig(

@@ -14,12 +14,12 @@ from roel_service.errors import ConfigError
 
 DETECTORS = ("edlines", "lsd")
 REPRESENTATIONS = ("binary", "timestamp", "count", "count_sum", "tos", "sits")
-PLANE_FIT_METHODS = ("vote", "ransac")
-MATCH_GLOBAL_METHODS = ("reassociate", "sampled")
+PLANE_FIT_METHODS = ("vote", "ransac", "direct", "none")
+MATCH_GLOBAL_METHODS = ("reassociate", "sampled", "none")
 MATCHERS = ("geometric", "xfeat", "aliked", "disk", "loftr")
 TRIANGULATE_GATES = ("pixel", "grassmann")
-REFINE_RESIDUALS = ("pixel", "grassmann")
-REFINE_LOSSES = ("cauchy", "squared")
+REFINE_RESIDUALS = ("pixel", "grassmann", "reprojection")
+REFINE_LOSSES = ("cauchy", "squared", "quartic")
 TRIM_METHODS = ("coverage", "cluster")
 
 
@@ -35,6 +35,7 @@ POSITIVE = Rule("> 0", lambda value: value > 0)
 NOT_NEGATIVE = Rule(">= 0", lambda value: value >= 0)
 SHARE = Rule("in [0, 1]", lambda value: 0 <= value <= 1)
 AT_LEAST_TWO = Rule(">= 2", lambda value: value >= 2)
+UP_TO_1000 = Rule("0 to 1000", lambda value: 0 <= value <= 1000)
 ALL_POSITIVE = Rule("positive values", lambda values: all(value > 0 for value in values))
 PRINTABLE = Rule("printable text", lambda value: isinstance(value, str) and value.isprintable())
 SOME_POSITIVE = Rule(
@@ -125,6 +126,8 @@ class DetectConfig(Stage, table="detect"):
         min_length_px, min_length_width_share: shortest line, the larger of px and share of width.
         merge_distance_px, merge_overlap: a line closer than this (perpendicular) to a longer one
             over at least this share of its length is the same line.
+        merge_across_polarities: lines of images of either polarity, or of both, may be the same;
+            their polarity is then unknown.
     """
 
     detector: str = parameter("edlines", one_of(DETECTORS))
@@ -139,6 +142,7 @@ class DetectConfig(Stage, table="detect"):
     min_length_width_share: float = parameter(0.0219, SHARE)
     merge_distance_px: float = parameter(1.0, NOT_NEGATIVE)
     merge_overlap: float = parameter(0.8, SHARE)
+    merge_across_polarities: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,11 +150,13 @@ class PlaneFitConfig(Stage, table="plane_fit"):
     """Space-time planes through the events near each detected line.
 
     Attributes:
-        method: `vote` (speed vote, then robust least squares) or `ransac` (the paper's).
+        method: `vote` (speed vote, then robust least squares), `ransac` (the paper's), `direct`
+            (the same for clusters of events, without detected lines) or `none` (lines stay as they
+            were detected, without events).
         candidate_distance_px: events this close to the detected line are candidates.
         extension_px: candidates may lie this far beyond the ends (`vote`).
         time_scale_px_per_ms: length of a millisecond in the paper's plane distance (`ransac`).
-        trial_count: random planes a line (`ransac`).
+        trial_count: random planes a line (`ransac`; ten times as many a cluster for `direct`).
         inlier_distance_px: a candidate this close to the plane supports it.
         min_inlier_count: fewer supporting events give no line.
         max_speed_widths_per_s, speed_count: range and steps of the vote on the normal speed.
@@ -160,6 +166,8 @@ class PlaneFitConfig(Stage, table="plane_fit"):
         duplicate_distance_px, duplicate_overlap: of two fits this close, the better one stays.
         support_event_count: supporting events kept a line, nearest in time to the frame.
         support_half_window_us: supporting events are no farther in time from the frame.
+        cluster_distance_px, cluster_time_scale_px_per_ms, cluster_min_event_count: radius, length
+            of a millisecond and least number of events of the clusters' DBSCAN (`direct`).
     """
 
     method: str = parameter("vote", one_of(PLANE_FIT_METHODS))
@@ -179,6 +187,9 @@ class PlaneFitConfig(Stage, table="plane_fit"):
     duplicate_overlap: float = parameter(0.6, SHARE)
     support_event_count: int = parameter(400, at_most(100_000))
     support_half_window_us: int = parameter(12_000, POSITIVE)
+    cluster_distance_px: float = parameter(3.0, Rule(">= 0.1", lambda value: value >= 0.1))
+    cluster_time_scale_px_per_ms: float = parameter(1.0, at_most(1000))
+    cluster_min_event_count: int = parameter(8, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +216,8 @@ class MatchGlobalConfig(Stage, table="match_global"):
 
     Attributes:
         method: `sampled` joins tracks that correspond in sampled frames (the paper's scheme);
-            `reassociate` projects triangulated lines into every frame, in rounds.
+            `reassociate` projects triangulated lines into every frame, in rounds; `none` leaves
+            the tracks of neighbouring frames as they are.
         frame_stride, neighbor_count: every how many frames, and against how many others, nearest
             by camera centre (`sampled`).
         matcher: finds correspondences (`sampled`): `geometric` by projecting provisional lines, the
@@ -254,6 +266,8 @@ class TriangulateConfig(Stage, table="triangulate"):
         max_angle_3d_deg, max_angle_2d_deg, max_perpendicular_px, max_perspective: the segment
             distances of the paper's reference [LIMAP] (`grassmann`).
         min_inlier_count: fewer inliers give no line.
+        iteration_count: Gauss-Newton steps over the inliers, with the cost of `refine` for `pixel`,
+            with the line term alone and equal weights for `grassmann`; 0 keeps the hypothesis.
         merge: cluster lines by DBSCAN and keep the longest of each cluster.
         merge_angle_deg, merge_disparity_px, merge_center_px: what counts as one in each part of
             the clustering space.
@@ -273,6 +287,7 @@ class TriangulateConfig(Stage, table="triangulate"):
     max_perpendicular_px: float = parameter(2.0, POSITIVE)
     max_perspective: float = parameter(0.015, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+    iteration_count: int = parameter(8, UP_TO_1000)
     merge: bool = False
     merge_angle_deg: float = parameter(2.0, POSITIVE)
     merge_disparity_px: float = parameter(2.0, POSITIVE)
@@ -284,13 +299,15 @@ class RefineConfig(Stage, table="refine"):
     """Joint least squares over the line term and the event term.
 
     Attributes:
-        residual: `pixel` (both terms as angles times focal length) or `grassmann` (as published).
-        loss: robust loss of an observation, or none.
-        loss_scale_px: residual at which the loss starts to bend.
+        residual: `pixel` (both terms as angles times focal length), `grassmann` (as published) or
+            `reprojection` (the observed ends' distances from the line's image, as LIMAP does).
+        loss: `cauchy`, `squared` (none) or `quartic` (the square of each squared residual: the
+            other reading of the published cost).
+        loss_scale_px: residual at which the Cauchy loss starts to bend.
         event_weight: weight of the event term against the line term; its unit follows `residual`.
         event_count_per_line: supporting events used an observation, nearest in time; 0 uses all.
         max_length_weight_px: observations longer than this weigh no more.
-        iteration_count: Gauss-Newton steps at the most.
+        iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as triangulated.
         max_residual_px: observations beyond it are left out of the next step.
         min_inlier_count: a line with fewer has diverged.
     """
@@ -301,7 +318,7 @@ class RefineConfig(Stage, table="refine"):
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
-    iteration_count: int = parameter(8, at_most(1000))
+    iteration_count: int = parameter(8, UP_TO_1000)
     max_residual_px: float = parameter(2.0, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
 

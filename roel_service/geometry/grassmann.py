@@ -19,6 +19,7 @@ import numpy as np
 from roel_service.arrays import FloatArray
 from roel_service.geometry.plucker import (
     arc_length,
+    camera_moment_jacobians,
     moment_from_point,
     nearest_to_origin,
     plucker_from_orthonormal,
@@ -217,8 +218,7 @@ def camera_plane_jacobians(
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives of `camera_plane_normal`.
 
-    m_c = R^T (m - c x v) moves by R^T (dm - c x dv) with the line and by
-    R^T ([m - c x v]x r + [v]x d) with the pose; then (I - n n^T)/|m_c| for its direction n.
+    Those of the moment m_c in the camera frame, then (I - n n^T)/|m_c| for its direction n.
 
     Args:
         T_world_camera: (*B) poses.
@@ -228,20 +228,15 @@ def camera_plane_jacobians(
     Returns:
         (*B, 3, 4) by line and (*B, 3, 6) by pose; NaN for a line through the camera centre.
     """
-    R_camera_world = np.swapaxes(T_world_camera.rotation, -1, -2)
-    centre = T_world_camera.translation
     direction, moment = plucker_from_orthonormal(U, phi)
-    by_direction, by_moment = plucker_jacobians(U, phi)
-    about_centre = moment - np.cross(centre, direction)
-    by_line = by_moment - skew(centre) @ by_direction
-    by_pose = np.concatenate(np.broadcast_arrays(skew(about_centre), skew(direction)), axis=-1)
-    length_m = norm(about_centre)[..., None, None]
-    normal = unit(about_centre)[..., None]
+    moment_camera = transform_lines(T_world_camera.inverse(), direction, moment)[1]
+    length_m = norm(moment_camera)[..., None, None]
+    normal = unit(moment_camera)[..., None]
     tangent = (np.eye(3) - normal * np.swapaxes(normal, -1, -2)) / np.where(
         length_m > 0, length_m, np.nan
     )
-    to_normal = R_camera_world @ tangent
-    return to_normal @ by_line, to_normal @ by_pose
+    by_line, by_pose = camera_moment_jacobians(T_world_camera, U, phi)
+    return tangent @ by_line, tangent @ by_pose
 
 
 def ray_line_jacobians(

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from roel_service.arrays import FloatArray
-from roel_service.geometry.se3 import SE3, rotation_from_vector
+from roel_service.geometry.se3 import SE3, rotation_from_vector, skew
 from roel_service.geometry.vectors import MIN_LENGTH, any_normal, dot, norm, unit
 
 # Sine of the angle below which two directions count as parallel: the position of an intersection
@@ -133,6 +133,32 @@ def transform_lines(
     """(*B, 3) directions and (*B, 3) moments, m, in frame b of lines given in frame a."""
     direction_b = T_b_a.rotate(direction)
     return direction_b, T_b_a.rotate(moment) + np.cross(T_b_a.translation, direction_b)
+
+
+def camera_moment_jacobians(
+    T_world_camera: SE3, U: FloatArray, phi: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of the moments of lines about camera centres, in the camera frames.
+
+    m_c = R^T (m - c x v) moves by R^T (dm - c x dv) with the line and by
+    R^T ([m - c x v]x r + [v]x d) with the pose.
+
+    Args:
+        T_world_camera: (*B) poses.
+        U: (*B, 3, 3) rotations of the orthonormal form, world.
+        phi: (*B,) rad.
+
+    Returns:
+        (*B, 3, 4) by line and (*B, 3, 6) by pose.
+    """
+    R_camera_world = np.swapaxes(T_world_camera.rotation, -1, -2)
+    centre = T_world_camera.translation
+    direction, moment = plucker_from_orthonormal(U, phi)
+    by_direction, by_moment = plucker_jacobians(U, phi)
+    about_centre = shift_origin(direction, moment, centre)
+    by_line = by_moment - skew(centre) @ by_direction
+    by_pose = np.concatenate(np.broadcast_arrays(skew(about_centre), skew(direction)), axis=-1)
+    return R_camera_world @ by_line, R_camera_world @ by_pose
 
 
 def shift_origin(direction: FloatArray, moment: FloatArray, origin: FloatArray) -> FloatArray:

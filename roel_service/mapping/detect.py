@@ -16,6 +16,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import DetectConfig
 from roel_service.mapping import detect_kernels
+from roel_service.mapping.frames import UNKNOWN_POLARITY
 from roel_service.mapping.representations import EventImage
 
 # OpenCV's LSD at its default scale of 0.8 puts lines this far to the upper left (px).
@@ -101,8 +102,9 @@ def detect_lines(
             config.min_length_px, config.min_length_width_share * image.grey.shape[1]
         )
         found = found[_lengths(found) >= min_length_px]
+        label = UNKNOWN_POLARITY if config.merge_across_polarities else image.polarity
         segments.append(found)
-        labels.append(np.full(len(found), image.polarity, np.int8))
+        labels.append(np.full(len(found), label, np.int8))
     return merge_seeds(np.concatenate(segments), np.concatenate(labels), config)
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from roel_service.arrays import Array
-from roel_service.config.stages import Config
+from roel_service.config.stages import Config, RefineConfig
 from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
 from roel_service.mapping.detect import LineDetector, detect_lines, line_detector
@@ -46,6 +46,9 @@ from roel_service.scene.events import EventSource, EventStream
 from roel_service.scene.lines import LineObservations, LineTracks
 from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
 from roel_service.scene.trajectory import Trajectory
+
+# Below every length: with this cap all observations weigh the same.
+EQUAL_WEIGHTS_PX = 1.0
 
 
 def build_line_map(
@@ -144,13 +147,31 @@ def _triangulate(
     found = triangulate_tracks(tracks, evidence.views, frames, config.triangulate, rng)
     run.count([status for status in found.statuses if status is not TrackStatus.TRIANGULATED])
     refined = run.without_diverged(
-        refine_lines(found.lines, found.tracks, evidence, frames, config.refine)
+        refine_lines(found.lines, found.tracks, evidence, frames, _triangulation_cost(config))
     )
     if not config.triangulate.merge:
         return refined
     refined, merged = merge_duplicates(refined, evidence.views, frames, config.triangulate)
     run.count(merged)
     return refined
+
+
+def _triangulation_cost(config: Config) -> RefineConfig:
+    """What refines a hypothesis over its inliers.
+
+    With the paper's gate it is the paper's cost: the sum of the line term alone, unweighted.
+    """
+    steps = config.triangulate.iteration_count
+    if config.triangulate.gate == "pixel":
+        return replace(config.refine, iteration_count=steps)
+    return replace(
+        config.refine,
+        residual="grassmann",
+        loss="squared",
+        event_weight=0.0,
+        max_length_weight_px=EQUAL_WEIGHTS_PX,
+        iteration_count=steps,
+    )
 
 
 def _lines_of_all_frames(

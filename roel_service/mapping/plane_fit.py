@@ -15,6 +15,7 @@ from roel_service.config.stages import PlaneFitConfig
 from roel_service.mapping import detect_kernels, plane_fit_kernels
 from roel_service.mapping.detect import Seeds
 from roel_service.mapping.frames import UNKNOWN_POLARITY, EventFrame
+from roel_service.mapping.plane_fit_direct import fit_clusters
 from roel_service.mapping.plane_fit_kernels import Grid, VoteSettings
 from roel_service.scene.lines import LineObservations
 
@@ -49,16 +50,20 @@ def fit_space_time_planes(
     """Refine the seeds of one frame and find their supporting events.
 
     Args:
-        seeds: detected lines, longest first.
+        seeds: detected lines, longest first; `direct` does without them.
         frame: events with the camera's rotation undone.
-        rng: draws the planes of `ransac`; `vote` is deterministic.
+        rng: draws the planes of `ransac` and `direct`; `vote` is deterministic.
     """
+    if config.method == "none":
+        return _as_detected(seeds)
     grid = _grid(frame)
     tau_ms = (frame.events.t_us - frame.events.t_ref_us).astype(np.float64) * 1e-3
     if config.method == "vote":
         lines, speeds, polarity = _fit_by_vote(seeds, frame, grid, tau_ms, config)
-    else:
+    elif config.method == "ransac":
         lines, speeds, polarity = _fit_by_ransac(seeds, frame, grid, tau_ms, config, rng)
+    else:
+        lines, speeds, polarity = _fit_directly(frame, tau_ms, config, rng)
     offsets, chosen = plane_fit_kernels.support(
         lines,
         speeds,
@@ -77,6 +82,18 @@ def fit_space_time_planes(
         event_offsets=offsets,
         event_xy_px=frame.ideal_px[chosen],
         event_dt_us=(frame.events.t_us[chosen] - frame.events.t_ref_us).astype(np.int32),
+    )
+
+
+def _as_detected(seeds: Seeds) -> FittedLines:
+    """The seeds themselves: not refined, of unknown speed, without supporting events."""
+    return FittedLines(
+        segments_px=seeds.segments_px,
+        polarity=seeds.polarity,
+        normal_speed_px_per_ms=np.zeros(len(seeds)),
+        event_offsets=np.zeros(len(seeds) + 1, np.int64),
+        event_xy_px=np.empty((0, 2), np.float32),
+        event_dt_us=np.empty(0, np.int32),
     )
 
 
@@ -131,6 +148,16 @@ def _fit_by_ransac(
         config.inlier_distance_px,
         config.min_inlier_count,
     )
+    polarity = np.full(len(lines), UNKNOWN_POLARITY, np.int8)
+    best = _best_first(lines, scores, polarity, config)
+    return lines[best], speeds[best], polarity[best]
+
+
+def _fit_directly(
+    frame: EventFrame, tau_ms: FloatArray, config: PlaneFitConfig, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, Array]:
+    """A line for each cluster of events of both polarities; the paper's alternative."""
+    lines, speeds, scores = fit_clusters(frame.compensated_px, tau_ms, config, rng)
     polarity = np.full(len(lines), UNKNOWN_POLARITY, np.int8)
     best = _best_first(lines, scores, polarity, config)
     return lines[best], speeds[best], polarity[best]

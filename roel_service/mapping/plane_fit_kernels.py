@@ -525,23 +525,14 @@ def fit_by_ransac(
             part = np.column_stack((u, s, scale_px_per_ms * tau))
             close = segment_distance(u, s, local.half) < candidate_distance_px
             points = np.concatenate((points, part[close]))
-        if len(points) < max(3, min_inlier_count):
+        plane, inliers = fit_plane(points, draws[i], inlier_distance_px, min_inlier_count)
+        a, b, c, offset = plane
+        # A plane across the seed is of another line.
+        if not abs(b) >= MIN_FACING:
             continue
-        inliers = best_plane(points, draws[i], inlier_distance_px)
-        if inliers.sum() < min_inlier_count:
-            continue
-        supporting = points[inliers]
-        centre = np.array([supporting[:, axis].mean() for axis in range(3)])
-        spread = supporting - centre
-        # The smallest eigenvector of the scatter is the normal of the total least squares plane.
-        a, b, c = np.linalg.eigh(spread.T @ spread)[1][:, 0]
-        in_image = np.sqrt(a * a + b * b)
-        if in_image < MIN_IMAGE_PART or abs(b) < MIN_FACING * in_image:
-            continue
-        # The normal points to the left of the seed, so that speeds count along that side.
-        in_image = np.copysign(in_image, b)
-        a, b, c = a / in_image, b / in_image, c / in_image
-        offset = a * centre[0] + b * centre[1] + c * centre[2]
+        if b < 0.0:
+            # The normal points to the left of the seed, so that speeds count along that side.
+            a, b, c, offset = -a, -b, -c, -offset
         # Slice at tau = 0: a u + b s = offset; the seed's ends are projected onto it.
         for end in range(2):
             along = local.half if end else -local.half
@@ -550,7 +541,7 @@ def fit_by_ransac(
             lines[i, end, 0] = local.qx + u_end * local.dx - s_end * local.dy
             lines[i, end, 1] = local.qy + u_end * local.dy + s_end * local.dx
         speeds[i] = -c * scale_px_per_ms
-        scores[i] = len(supporting)
+        scores[i] = inliers.sum()
     return lines, speeds, scores
 
 
@@ -562,20 +553,61 @@ def segment_distance(u: Array, s: Array, half: float) -> Array:
 
 
 @numba.njit(cache=True, nogil=True)
+def fit_plane(
+    points: Array, draws: Array, inlier_distance: float, min_inlier_count: int
+) -> tuple[tuple[float, float, float, float], Array]:
+    """Total least squares plane over the inliers of the best random one.
+
+    Args:
+        points: (n, 3) two coordinates of the image and scaled time, px.
+        draws: (T, 3) as in `fit_by_ransac`.
+
+    Returns:
+        (a, b, c, offset) of the plane a x + b y + c t = offset with a^2 + b^2 = 1, NaN where there
+        is none or it is an instant rather than a moving line; and the (n,) inliers.
+    """
+    nothing = (np.nan, np.nan, np.nan, np.nan)
+    inliers = np.zeros(len(points), np.bool_)
+    if len(points) < 3:
+        return nothing, inliers
+    inliers = best_plane(points, draws, inlier_distance)
+    if inliers.sum() < max(3, min_inlier_count):
+        return nothing, inliers
+    supporting = points[inliers]
+    centre = np.array([supporting[:, axis].mean() for axis in range(3)])
+    spread = supporting - centre
+    # The smallest eigenvector of the scatter is the normal of the total least squares plane.
+    a, b, c = np.linalg.eigh(spread.T @ spread)[1][:, 0]
+    in_image = np.sqrt(a * a + b * b)
+    if in_image < MIN_IMAGE_PART:
+        return nothing, inliers
+    a, b, c = a / in_image, b / in_image, c / in_image
+    return (a, b, c, a * centre[0] + b * centre[1] + c * centre[2]), inliers
+
+
+@numba.njit(cache=True, nogil=True)
 def best_plane(points: Array, draws: Array, inlier_distance: float) -> Array:
     """(n,) bool: inliers of the random plane that has the most of them."""
-    best = np.zeros(len(points), np.bool_)
     best_count = 0
+    best = np.zeros(4)
     for trial in range(len(draws)):
         p = points[int(draws[trial, 0] * len(points))]
         q = points[int(draws[trial, 1] * len(points))]
         r = points[int(draws[trial, 2] * len(points))]
-        normal = np.cross(q - p, r - p)
-        length = np.sqrt(np.sum(normal * normal))
+        a = (q[1] - p[1]) * (r[2] - p[2]) - (q[2] - p[2]) * (r[1] - p[1])
+        b = (q[2] - p[2]) * (r[0] - p[0]) - (q[0] - p[0]) * (r[2] - p[2])
+        c = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0])
+        length = np.sqrt(a * a + b * b + c * c)
         if length < 1e-9:
             continue
-        inliers = np.abs((points - p) @ (normal / length)) < inlier_distance
-        count = inliers.sum()
+        a, b, c = a / length, b / length, c / length
+        offset = a * p[0] + b * p[1] + c * p[2]
+        count = 0
+        for k in range(len(points)):
+            distance = a * points[k, 0] + b * points[k, 1] + c * points[k, 2] - offset
+            count += abs(distance) < inlier_distance
         if count > best_count:
-            best, best_count = inliers, count
-    return best
+            best_count = count
+            best[0], best[1], best[2], best[3] = a, b, c, offset
+    distances = points @ best[:3] - best[3]
+    return np.asarray((np.abs(distances) < inlier_distance) & (best_count > 0))

@@ -5,12 +5,17 @@ unknown, and all of them are solved together as a batch of systems of four: damp
 the orthonormal parameterisation, about an own origin for each line (the mean of its cameras), where
 the moment's length is the viewing distance and far from zero.
 
-Two costs, see `RefineConfig.residual`:
+Three costs, see `RefineConfig.residual`:
 
 - `pixel`: line and event term are quadratic forms y^T G y / |m_c|^2 of the Pluecker coordinates
   y = (v, m), in squared pixels (`moments`), with a robust weight an observation.
 - `grassmann`: the published plane-to-line residual (n.v, d/sqrt(1 + d^2)) weighted by the 2D
   length, plus lambda times the sum over the events.
+- `reprojection`: LIMAP's, the distances of the observed ends from the line's image in pixels, and
+  the event term of `pixel`.
+
+With the loss `quartic` every term e of a cost counts as e^2; the events of one observation together
+as n times their mean e, squared.
 """
 
 from __future__ import annotations
@@ -21,8 +26,9 @@ import numpy as np
 
 from roel_service.arrays import Array, BoolArray, FloatArray
 from roel_service.config.stages import RefineConfig
-from roel_service.geometry import grassmann, plucker
-from roel_service.geometry.vectors import dot
+from roel_service.geometry import grassmann, plucker, reprojection
+from roel_service.geometry.se3 import SE3
+from roel_service.geometry.vectors import dot, norm
 from roel_service.mapping import refine_kernels
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
@@ -98,6 +104,13 @@ class _System:
     gradient: FloatArray
     hessian: FloatArray
 
+    def __add__(self, other: _System) -> _System:
+        return _System(
+            cost=self.cost + other.cost,
+            gradient=self.gradient + other.gradient,
+            hessian=self.hessian + other.hessian,
+        )
+
 
 class _Problem:
     """The observations of all lines in one list, each row with its line."""
@@ -111,6 +124,8 @@ class _Problem:
         config: RefineConfig,
     ) -> None:
         self.config = config
+        self.quartic = config.loss == "quartic"
+        self.K = frames.K
         self.focal_px = frames.focal_px
         self.offsets = tracks.offsets
         self.line = tracks.track_of_row
@@ -121,15 +136,20 @@ class _Problem:
         self.observation = tracks.observation
         self.evidence = evidence
         self.rotation = frames.T_world_camera.rotation
-        if config.residual == "pixel":
-            both = evidence.segment_forms + config.event_weight * evidence.event_forms
-            self.forms = self.focal_px**2 * both
-            cap = config.max_length_weight_px
-            self.weight = np.minimum(self.views.length_px, cap) / cap
-        else:
+        length = np.minimum(self.views.length_px, config.max_length_weight_px)
+        if config.residual == "grassmann":
+            # As published: the length in pixels, and lambda for each event.
             event_count = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
-            self.forms = config.event_weight * event_count[:, None, None] * evidence.event_forms
-            self.weight = self.views.length_px
+            self.weight = length
+            self.forms = evidence.event_forms
+            self.form_weight = config.event_weight * event_count[tracks.observation]
+        else:
+            forms = config.event_weight * evidence.event_forms
+            if config.residual == "pixel":
+                forms = evidence.segment_forms + forms
+            self.weight = length / config.max_length_weight_px
+            self.forms = self.focal_px**2 * forms
+            self.form_weight = self.weight
 
     def total(self, rows: FloatArray) -> FloatArray:
         """(L, ...) sums of (S, ...) rows over each line."""
@@ -165,33 +185,30 @@ class _Problem:
         widening = FIRST_GATE if loose else 1.0
         return np.asarray(residual_px < widening * self.config.max_residual_px)
 
-    def robust_weight(self, residual_px: FloatArray) -> FloatArray:
+    def robust_weight(self, state: _State, residual_px: FloatArray) -> FloatArray:
         """(S,) weights of iterated reweighting."""
-        if self.config.loss == "squared":
+        if self.config.loss != "cauchy":
             return np.ones_like(residual_px)
+        if self.config.residual == "reprojection":
+            residual_px = norm(self._end_distances_px(state))
         return np.asarray(1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2))
 
     def cost(self, state: _State, weight: FloatArray) -> FloatArray:
         """(L,) with fixed (S,) robust weights."""
+        cost = self._form_cost(state, weight * self.form_weight)
         if self.config.residual == "pixel":
-            return self._form_cost(state, weight * self.weight)
-        planes = self._plane_system(state, weight * self.weight)
-        return self._form_cost(state, weight) + planes.cost
+            return cost
+        return cost + self._line_system(state, weight * self.weight).cost
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Cost, gradient and Gauss-Newton Hessian with fixed (S,) robust weights."""
+        forms = self._form_system(state, weight * self.form_weight)
         if self.config.residual == "pixel":
-            return self._form_system(state, weight * self.weight)
-        events = self._form_system(state, weight)
-        planes = self._plane_system(state, weight * self.weight)
-        return _System(
-            cost=events.cost + planes.cost,
-            gradient=events.gradient + planes.gradient,
-            hessian=events.hessian + planes.hessian,
-        )
+            return forms
+        return forms + self._line_system(state, weight * self.weight)
 
     def _form_cost(self, state: _State, weight: FloatArray) -> FloatArray:
-        """(L,) sum w y^T G y / |m_c|^2."""
+        """(L,) sum w e with e = y^T G y / |m_c|^2, or w e^2."""
         v, m = state.plucker
         views = self.evidence.views
         return np.asarray(
@@ -206,11 +223,12 @@ class _Problem:
                 self.observation,
                 self.forms,
                 weight,
+                self.quartic,
             )
         )
 
     def _form_system(self, state: _State, weight: FloatArray) -> _System:
-        """Of sum w y^T G y / |m_c|^2, y the line in the camera frame of each observation."""
+        """Of sum w e with e = y^T G y / |m_c|^2, y the line in each camera's frame, or w e^2."""
         v, m = state.plucker
         dv, dm = plucker.plucker_jacobians(state.U, state.phi)
         views = self.evidence.views
@@ -226,11 +244,37 @@ class _Problem:
             self.observation,
             self.forms,
             weight,
+            self.quartic,
         )
         return _System(cost=cost, gradient=gradient, hessian=hessian)
 
-    def _plane_system(self, state: _State, weight: FloatArray) -> _System:
-        """Of sum w |(n.v, d / sqrt(1 + d^2))|^2, taken at the middle of the observed interval."""
+    def _line_system(self, state: _State, weight: FloatArray) -> _System:
+        """Of the line term where it is not among the forms: sum w |r|^2, or w |r|^4."""
+        if self.config.residual == "grassmann":
+            r, J = self._plane_residuals(state)
+        else:
+            r, J = self._end_residuals(state)
+        squared = dot(r, r)
+        slope = np.einsum("sij,si->sj", J, r)
+        hessian = np.swapaxes(J, -1, -2) @ (weight[:, None, None] * J)
+        if not self.quartic:
+            return _System(
+                cost=self.total(weight * squared),
+                gradient=self.total(weight[:, None] * slope),
+                hessian=self.total(hessian),
+            )
+        bent = weight[:, None, None] * slope[:, :, None] * slope[:, None, :]
+        return _System(
+            cost=self.total(weight * squared**2),
+            gradient=self.total((2.0 * weight * squared)[:, None] * slope),
+            hessian=self.total(2.0 * squared[:, None, None] * hessian + 4.0 * bent),
+        )
+
+    def _plane_residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """(S, 2) values (n.v, d / sqrt(1 + d^2)) at the middles of the observed intervals.
+
+        Also their (S, 2, 4) derivatives.
+        """
         v, m = state.plucker
         along = self._middles_m(state)[self.line]
         foot = plucker.nearest_to_origin(v, m)[self.line] + along[:, None] * v[self.line]
@@ -238,12 +282,30 @@ class _Problem:
         by_line, _ = grassmann.plane_line_jacobians(
             self.views.normal, self.views.centre, state.U[self.line], state.phi[self.line], along
         )
-        weighted = weight[:, None, None] * by_line
-        return _System(
-            cost=self.total(weight * dot(r, r)),
-            gradient=self.total(np.einsum("sij,si->sj", weighted, r)),
-            hessian=self.total(np.swapaxes(by_line, -1, -2) @ weighted),
+        return r, by_line
+
+    def _end_residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """(S, 2) signed distances of the observed ends, px, and their (S, 2, 4) derivatives."""
+        by_line, _ = reprojection.end_line_jacobians(
+            self.views.segment_px,
+            self._cameras,
+            state.U[self.line],
+            state.phi[self.line],
+            self.K,
         )
+        return self._end_distances_px(state), by_line
+
+    def _end_distances_px(self, state: _State) -> FloatArray:
+        """(S, 2) signed distances of the observed ends from the images of their lines, px."""
+        v, m = state.plucker
+        return reprojection.end_line_distances_px(
+            self.views.segment_px, self._cameras, v[self.line], m[self.line], self.K
+        )
+
+    @property
+    def _cameras(self) -> SE3:
+        """(S) T_world_camera about the origin of each row's line."""
+        return SE3(rotation=self.rotation[self.views.frame], translation=self.views.centre)
 
     def _middles_m(self, state: _State) -> FloatArray:
         """(L,) mean arc length of the middles of the observed intervals that cut the line."""
@@ -279,14 +341,14 @@ def refine_lines(
     for iteration in range(config.iteration_count):
         residual_px = problem.residual_px(state)
         inlier = problem.inliers(residual_px, loose=iteration < LOOSE_ITERATION_COUNT)
-        weight = problem.robust_weight(residual_px) * inlier
+        weight = problem.robust_weight(state, residual_px) * inlier
         state, damping = _step(problem, state, weight, damping)
     residual_px = problem.residual_px(state)
     inlier = problem.inliers(residual_px, loose=False)
-    weight = problem.robust_weight(residual_px) * inlier
+    weight = problem.robust_weight(state, residual_px) * inlier
     in_pixels = problem
-    if config.residual != "pixel":
-        metric = replace(config, residual="pixel", event_weight=1.0)
+    if config.residual != "pixel" or problem.quartic:
+        metric = replace(config, residual="pixel", loss="squared", event_weight=1.0)
         in_pixels = _Problem(lines, tracks, evidence, frames, metric)
     information = in_pixels.system(state, weight).hessian
     return _refined(problem, tracks, state, residual_px, inlier, information)

@@ -75,6 +75,7 @@ def form_cost(
     observation: Array,
     forms: Array,
     weight: Array,
+    quartic: bool,
 ) -> Array:
     """(L,) the cost alone; arguments as in `form_system`."""
     cost = np.zeros(len(v))
@@ -93,7 +94,8 @@ def form_cost(
             for i in range(6):
                 for j in range(6):
                     value += y[i] * forms[k, i, j] * y[j]
-            cost[line] += weight[row] * value / squared
+            quotient = value / squared
+            cost[line] += weight[row] * (quotient * quotient if quartic else quotient)
     return cost
 
 
@@ -110,6 +112,7 @@ def form_system(
     observation: Array,
     forms: Array,
     weight: Array,
+    quartic: bool,
 ) -> tuple[Array, Array, Array]:
     """Cost, gradient and Gauss-Newton Hessian of each line.
 
@@ -124,6 +127,7 @@ def form_system(
         observation: (S,) of each row.
         forms: (M, 6, 6) of all observations, camera frame.
         weight: (S,) of each row; rows of weight zero are passed over.
+        quartic: the cost of a row is its weight times the square of what it is otherwise.
 
     Returns:
         (L,), (L, 4) and (L, 4, 4).
@@ -136,6 +140,7 @@ def form_system(
     column = np.empty(6)
     J = np.empty((6, 4))
     GJ = np.empty((6, 4))
+    slope = np.empty(4)
     for line in range(line_count):
         for row in range(offsets[line], offsets[line + 1]):
             if weight[row] == 0.0:
@@ -161,20 +166,23 @@ def form_system(
                 for j in range(6):
                     value += y[i] * forms[k, i, j] * y[j]
             quotient = value / squared
-            scale = weight[row] / squared
-            cost[line] += weight[row] * quotient
+            cost[line] += weight[row] * (quotient * quotient if quartic else quotient)
+            scale = weight[row] * (2.0 * quotient if quartic else 1.0) / squared
+            bend = 4.0 * weight[row] / (squared * squared) if quartic else 0.0
             for p in range(4):
-                slope = 0.0
+                value = 0.0
                 for i in range(6):
-                    slope += y[i] * GJ[i, p]
+                    value += y[i] * GJ[i, p]
                 # The quotient's own derivative: its denominator grows too.
                 pull = y[3] * J[3, p] + y[4] * J[4, p] + y[5] * J[5, p]
-                gradient[line, p] += scale * (slope - quotient * pull)
+                slope[p] = value - quotient * pull
+                gradient[line, p] += scale * slope[p]
+            for p in range(4):
                 for q in range(p, 4):
                     value = 0.0
                     for i in range(6):
                         value += J[i, p] * GJ[i, q]
-                    hessian[line, p, q] += scale * value
+                    hessian[line, p, q] += scale * value + bend * slope[p] * slope[q]
         for p in range(4):
             for q in range(p):
                 hessian[line, p, q] = hessian[line, q, p]
