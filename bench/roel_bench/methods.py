@@ -112,4 +112,7 @@ def find_method(name: str) -> Method:
         return PEERS[name]
     if name in VARIANTS:
         return from_variant(VARIANTS[name])
-    raise ConfigError("method", "one of " + ", ".join([*PEERS, *VARIANTS]), name)
+    expected = (
+        f"a preset, one of {', '.join(PEERS)}, or a variant such as 'default without smoothing'"
+    )
+    raise ConfigError("method", expected, repr(name))

@@ -134,15 +134,19 @@ def digest_of(text: str) -> str:
 
 def write_results(path: Path, results: Results) -> None:
     """Write all rows; the file is whole or as it was before."""
-    document = {
+    with whole_file(path) as temporary:
+        text = json.dumps(to_document(results), indent=1, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def to_document(results: Results) -> dict[str, Any]:
+    """What JSON can hold of them."""
+    return {
         "format": FORMAT,
         "machine": results.machine,
         "versions": results.versions,
         "rows": [_plain(asdict(row)) for row in results.rows],
     }
-    with whole_file(path) as temporary:
-        text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
 
 
 def read_results(path: Path) -> Results:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from roel_bench.catalogue import (
     LARGE_ROOMS,
@@ -89,13 +89,12 @@ SUITES = {
 def select(
     suite: str, scenes: tuple[str, ...] | None = None, methods: tuple[str, ...] | None = None
 ) -> list[Cell]:
-    """The cells of a suite, each once and scene by scene; on other scenes, or with some methods.
+    """The cells of a suite, each once and scene by scene.
 
     Args:
         suite: one of `SUITES`.
-        scenes: take the place of the suite's own.
-        methods: of the suite's methods, only these; where the suite has none of them, maps of
-            these.
+        scenes: only these; one that the suite does not know gets whatever the others get.
+        methods: only these; ones that the suite does not know make maps of all its scenes.
 
     Raises:
         InputError: no suite of that name.
@@ -103,16 +102,15 @@ def select(
     if suite not in SUITES:
         raise InputError("suite", "one of " + ", ".join(SUITES), suite)
     cells = list(dict.fromkeys(SUITES[suite]))
+    own_scenes = tuple(dict.fromkeys(cell.scene for cell in cells))
     if methods is not None:
-        chosen = [cell for cell in cells if cell.method in methods]
-        own = dict.fromkeys(cell.scene for cell in cells)
-        cells = chosen or _cells(MAP, own, methods)
-    if scenes is not None:
-        pairs = dict.fromkeys((cell.task, cell.method, cell.disturbance) for cell in cells)
-        return [
-            Cell(task=task, scene=scene, method=method, disturbance=disturbance)
-            for scene in scenes
-            for task, method, disturbance in pairs
-        ]
-    order = {scene: index for index, scene in enumerate(dict.fromkeys(c.scene for c in cells))}
-    return sorted(cells, key=lambda cell: order[cell.scene])
+        known = {cell.method for cell in cells}
+        new = [method for method in methods if method not in known]
+        cells = [cell for cell in cells if cell.method in methods] + _cells(MAP, own_scenes, new)
+    return [cell for scene in scenes or own_scenes for cell in _of_scene(cells, scene)]
+
+
+def _of_scene(cells: list[Cell], scene: str) -> list[Cell]:
+    """The cells of one scene; for a new scene, those of all scenes with its name instead."""
+    own = [cell for cell in cells if cell.scene == scene]
+    return own or list(dict.fromkeys(replace(cell, scene=scene) for cell in cells))

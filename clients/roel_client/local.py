@@ -173,3 +173,28 @@ def serve(
     from roel_service.service import server
 
     asyncio.run(server.serve(data, host, port, insecure=insecure, on_ready=on_ready))
+
+
+def bench_mapping(
+    out: Path,
+    *,
+    suite: str,
+    scenes: tuple[str, ...] | None,
+    methods: tuple[str, ...] | None,
+    data: Path | None,
+    rooms: Path,
+    progress: ProgressCallback,
+) -> tuple[dict[str, Any], str]:
+    """Run a suite of the benchmark in a folder; all its rows, as a document and as Markdown."""
+    from roel_bench import suites, tables
+    from roel_bench.catalogue import Places
+    from roel_bench.results import to_document
+    from roel_bench.runner import Runner
+
+    cells = suites.select(suite, scenes, methods)
+    results = Runner(places=Places(data=data, rooms=rooms), folder=out, progress=progress).run(
+        cells
+    )
+    text = tables.all_rows(results)
+    tables.write_text(out / "mapping.md", text)
+    return to_document(results), text

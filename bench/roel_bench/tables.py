@@ -1,0 +1,84 @@
+"""Rows as Markdown tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from roel_bench.results import Results, Row
+from roel_bench.suites import FRONT_END, MAP
+from roel_service.io.files import whole_file
+
+# Columns of a map's table: heading, figure, decimals.
+MAP_COLUMNS = (
+    ("lines or points", "entity_count", 0),
+    ("accuracy, mm", "accuracy_mm", 1),
+    ("median, mm", "accuracy_median_mm", 1),
+    ("completion, mm", "completion_mm", 0),
+    ("IoU 5", "iou_5", 3),
+    ("IoU 10", "iou_10", 3),
+    ("IoU 20", "iou_20", 3),
+    ("precision 20", "precision_20", 2),
+    ("recall 20", "recall_20", 2),
+)
+FRAME_COLUMNS = (
+    ("lines a frame", "lines_per_frame", 0),
+    ("precision", "precision", 3),
+    ("recall", "recall", 3),
+    ("F-score", "f_score", 3),
+    ("F at 2 px", "f_score_2px", 3),
+    ("F slow", "f_score_slow", 3),
+    ("F fast", "f_score_fast", 3),
+    ("offset, px", "offset_median_px", 2),
+    ("bias, px", "bias_along_motion_px", 2),
+    ("explained events", "explained_event_share", 2),
+    ("ms a frame", "ms_per_frame", 0),
+)
+Column = tuple[str, str, int]
+MISSING = "-"
+
+
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [headings, ["---"] * len(headings), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: float | None, decimals: int) -> str:
+    """A figure with so many decimals, or a dash where there is none."""
+    return MISSING if value is None else f"{value:.{decimals}f}"
+
+
+def mean(rows: Iterable[Row], figure: str) -> float | None:
+    """Mean of a figure over the rows that have it; None where none has."""
+    values = [v for row in rows if (v := row.figures.get(figure)) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def figure_cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[str]:
+    """Means over some rows, a cell a column."""
+    return [number(mean(rows, figure), decimals) for _, figure, decimals in columns]
+
+
+def all_rows(results: Results) -> str:
+    """Every row of a run, maps first."""
+    blocks = []
+    for task, title, columns in (
+        (MAP, "Maps", MAP_COLUMNS),
+        (FRONT_END, "Lines of single frames", FRAME_COLUMNS),
+    ):
+        rows = results.select(lambda row, task=task: row.task == task)  # type: ignore[misc]
+        if rows:
+            headings = ["scene", "disturbance", "method", *(name for name, _, _ in columns)]
+            cells = (
+                [row.scene, row.disturbance, row.method, *figure_cells([row], columns)]
+                for row in rows
+            )
+            blocks.append(f"## {title}\n\n{table(headings, cells)}\n")
+    return "\n".join(blocks)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file that is whole or not there."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
