@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from roel_bench.peers.emvs import EmvsSettings, map_points
+import numpy as np
+
+from roel_bench.peers.el_slam import ElSlamSettings
+from roel_bench.peers.el_slam import map_segments as el_slam_segments
+from roel_bench.peers.emvs import EmvsSettings
+from roel_bench.peers.emvs import map_points as emvs_points
+from roel_bench.peers.limap import LIMAP_SETTINGS, LimapSettings
+from roel_bench.peers.limap import map_segments as limap_segments
 from roel_bench.results import config_digest, digest_of
 from roel_bench.scenes import Scene
 from roel_bench.variants import VARIANTS, Variant
 from roel_service.arrays import FloatArray
-from roel_service.errors import ConfigError, InputError
+from roel_service.errors import ConfigError, InputError, NoAnswerError
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.progress import ProgressCallback
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
+
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -50,6 +61,10 @@ class Method:
     run: Callable[[Scene, ProgressCallback], Mapped]
 
 
+# What a peer makes of a scene: (P, 3) points, m, or lines.
+PeerMap = Callable[[Scene, Trajectory, ProgressCallback], LineMap | FloatArray]
+
+
 def _poses(scene: Scene) -> Trajectory:
     if scene.trajectory is None:
         raise InputError(scene.name, "a scene with poses", "none")
@@ -75,10 +90,6 @@ def from_variant(variant: Variant) -> Method:
     return Method(name=variant.name, digest=config_digest(config), run=run)
 
 
-# What a peer makes of a scene: (P, 3) points, m, or lines.
-PeerMap = Callable[[Scene, Trajectory, ProgressCallback], LineMap | FloatArray]
-
-
 def _peer(name: str, settings: object, make: PeerMap) -> Method:
     """A method of somebody else's, timed as a whole."""
 
@@ -90,18 +101,46 @@ def _peer(name: str, settings: object, make: PeerMap) -> Method:
     return Method(name=name, digest=digest_of(repr(settings)), run=run)
 
 
-EMVS = EmvsSettings()
+def _emvs(settings: EmvsSettings) -> Method:
+    """EMVS with EVO's keyframes; the one peer whose map is points."""
+
+    def make(scene: Scene, poses: Trajectory, progress: ProgressCallback) -> FloatArray:
+        return emvs_points(scene.events, poses, scene.camera, settings, progress)
+
+    return _peer("EMVS", settings, make)
+
+
+def _el_slam(settings: ElSlamSettings) -> Method:
+    """The mapping of EL-SLAM."""
+
+    def make(scene: Scene, poses: Trajectory, progress: ProgressCallback) -> LineMap:
+        return LineMap.from_segments(
+            el_slam_segments(scene.events, poses, scene.camera, settings, progress)
+        )
+
+    return _peer("EL-SLAM", settings, make)
+
+
+def _limap(name: str, settings: LimapSettings) -> Method:
+    """LIMAP on event images; lines that it cannot find are no lines, not a fault."""
+
+    def make(scene: Scene, poses: Trajectory, progress: ProgressCallback) -> LineMap:
+        try:
+            segments = limap_segments(scene.events, poses, scene.camera, settings, progress)
+        except NoAnswerError as error:
+            logger.warning("LIMAP on %s: %s", scene.name, error)
+            segments = np.empty((0, 2, 3))
+        return LineMap.from_segments(segments)
+
+    return _peer(f"LIMAP: {name}", settings, make)
+
 
 PEERS = {
     method.name: method
     for method in (
-        _peer(
-            "EMVS",
-            EMVS,
-            lambda scene, poses, progress: map_points(
-                scene.events, poses, scene.camera, EMVS, progress
-            ),
-        ),
+        _emvs(EmvsSettings()),
+        _el_slam(ElSlamSettings()),
+        *(_limap(name, settings) for name, settings in LIMAP_SETTINGS.items()),
     )
 }
 

@@ -37,7 +37,7 @@ from roel_bench.scenes import MapTruth, Scene
 from roel_bench.scores import score
 from roel_bench.suites import FRONT_END, PRESET_NAMES, Cell
 from roel_bench.variants import find_variant
-from roel_service.errors import InputError
+from roel_service.errors import InputError, NotFoundError
 from roel_service.progress import Progress, ProgressCallback, ignore
 
 logger = logging.getLogger(__name__)
@@ -80,7 +80,11 @@ class Runner:
             step = self._step(cell, index, len(cells))
             if scene is None or scene.name != cell.scene:
                 scene = open_scene(cell.scene, self.places, step)
-            row = self._row(cell, scene, truths, step)
+            try:
+                row = self._row(cell, scene, truths, step)
+            except NotFoundError as error:
+                logger.warning("left out: %s", error)  # a peer that is not installed
+                continue
             results = results.with_row(row)
             write_results(self.folder / FILE_NAME, results)
             logger.info("%s %s %s: %s", cell.task, cell.scene, cell.method, row.figures)

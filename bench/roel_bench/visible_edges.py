@@ -7,12 +7,13 @@ left out first, by casting a ray to each.
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 
 from roel_bench.scenes import MapTruth
-from roel_service.arrays import Array, BoolArray, FloatArray
+from roel_service.arrays import BoolArray, FloatArray
 from roel_service.errors import CloudError
 from roel_service.geometry.projection import project
 from roel_service.geometry.se3 import SE3
@@ -34,7 +35,7 @@ class VisibleEdges:
         self._camera = camera
 
     @cached_property
-    def _rays(self) -> Array:
+    def _rays(self) -> Any:
         """Open3D's ray caster over the surfaces."""
         import open3d  # seconds to load, so only where a ray is cast
 
