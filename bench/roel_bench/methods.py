@@ -25,7 +25,6 @@ from roel_service.progress import ProgressCallback
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
 
-
 logger = logging.getLogger(__name__)
 
 

@@ -39,7 +39,10 @@ MISSING = "-"
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table."""
+    """A Markdown table, or a word where it would have no row."""
+    rows = list(rows)
+    if not rows:
+        return "Not run."
     lines = [headings, ["---"] * len(headings), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
