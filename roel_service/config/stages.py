@@ -189,7 +189,7 @@ class PlaneFitConfig(Stage, table="plane_fit"):
     support_half_window_us: int = parameter(12_000, POSITIVE)
     cluster_distance_px: float = parameter(3.0, Rule(">= 0.1", lambda value: value >= 0.1))
     cluster_time_scale_px_per_ms: float = parameter(1.0, at_most(1000))
-    cluster_min_event_count: int = parameter(8, POSITIVE)
+    cluster_min_event_count: int = parameter(4, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,7 +53,8 @@ class EventFrame:
     """The events around one time.
 
     Attributes:
-        events: the largest window, as views of the columns; t_ref_us is the frame's time.
+        events: the largest window; t_ref_us is the frame's time. Those of one time are in the
+            order of their pixels, whatever order they came in.
         ideal_px: (K, 2) float32, undistorted, at each event's own time.
         compensated_px: (K, 2) float32, with the camera's rotation undone.
         windows: for each configured window its half-open range of `events`, smallest first.
@@ -155,7 +156,7 @@ def event_frame(
     ranges = [window_range(events.t_us, t_us, count, frames) for count in counts]
     start = min(first for first, _ in ranges)
     stop = max(last for _, last in ranges)
-    largest = events.slice(start, stop, t_us)
+    largest = _in_fixed_order(events.slice(start, stop, t_us))
     own_px = ideal_px[largest.y, largest.x]
     compensated_px = own_px
     if frames.compensate_rotation and len(largest):
@@ -184,7 +185,7 @@ def window_range(
     """Half-open index range of about `count` events, half of them on each side of a time.
 
     The window is never shorter than `min_half_window_us` nor longer than `max_half_window_us` on
-    either side.
+    either side, and holds all events of a time or none.
     """
     middle = int(np.searchsorted(t_us, centre_us))
     reach = [config.max_half_window_us, config.min_half_window_us]
@@ -192,7 +193,22 @@ def window_range(
     high_max, high_min = np.searchsorted(t_us, [centre_us + r for r in reach])
     start = min(max(middle - count // 2, int(low_max)), int(low_min))
     stop = max(min(middle + count // 2, int(high_max)), int(high_min))
+    if start < stop:
+        start = int(np.searchsorted(t_us, t_us[start]))
+        stop = int(np.searchsorted(t_us, t_us[stop - 1], side="right"))
     return start, stop
+
+
+def _in_fixed_order(events: EventSlice) -> EventSlice:
+    """The same events; those of one time by row, column and polarity."""
+    order = frames_kernels.fixed_order(events.t_us, events.x, events.y, events.polarity)
+    return EventSlice(
+        t_us=events.t_us,
+        x=events.x[order],
+        y=events.y[order],
+        polarity=events.polarity[order],
+        t_ref_us=events.t_ref_us,
+    )
 
 
 def _compensated(

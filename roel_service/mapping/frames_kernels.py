@@ -1,10 +1,45 @@
-"""Loop over events: undistortion and rotation compensation."""
+"""Loops over events: a fixed order, undistortion and rotation compensation."""
 
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 from roel_service.arrays import Array
+
+# Up to this many events of one time, insertion sort is the fastest.
+SHORT_RUN = 32
+
+
+@numba.njit(cache=True, nogil=True)
+def fixed_order(t_us: Array, x: Array, y: Array, polarity: Array) -> Array:
+    """(K,) indices that sort events of equal time by row, column and polarity.
+
+    Args:
+        t_us: (K,) non-decreasing.
+        x, y, polarity: (K,) event columns.
+    """
+    count = len(t_us)
+    place = np.empty(count, np.int64)
+    for k in range(count):
+        place[k] = (np.int64(y[k]) << 17) + (np.int64(x[k]) << 1) + (polarity[k] > 0)
+    order = np.arange(count)
+    start = 0
+    while start < count:
+        stop = start + 1
+        while stop < count and t_us[stop] == t_us[start]:
+            stop += 1
+        if stop - start > SHORT_RUN:
+            order[start:stop] = start + np.argsort(place[start:stop], kind="mergesort")
+        else:
+            for k in range(start + 1, stop):
+                i = k
+                while i > start and place[order[i - 1]] > place[k]:
+                    order[i] = order[i - 1]
+                    i -= 1
+                order[i] = k
+        start = stop
+    return order
 
 
 @numba.njit(cache=True, nogil=True)

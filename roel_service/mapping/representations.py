@@ -2,8 +2,7 @@
 
 Paper: "Multi-window, Multi-representation Line Detection" (binary and timestamp images), and the
 surfaces that it compares with: the Threshold-Ordinal Surface (Glover et al., luvHarris, 2021) and
-the Speed-Invariant Time Surface (Manderscheid et al., 2019). These two follow the order of the
-events: where several have the same time, it matters in which order they come.
+the Speed-Invariant Time Surface (Manderscheid et al., 2019).
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from roel_service.config.stages import DetectConfig, FramesConfig
 from roel_service.geometry import projection
 from roel_service.geometry.projection import undistortion_table
 from roel_service.geometry.se3 import SE3, rotation_from_vector
+from roel_service.mapping import frames_kernels
 from roel_service.mapping.frames import (
     event_frame,
     frame_slices,
@@ -68,6 +69,11 @@ class TestWindowRange:
         t_us = np.repeat(np.arange(900, 1100), 10)
         start, stop = window_range(t_us, 1000, 4, WINDOW)
         assert (t_us[start], t_us[stop - 1]) == (990, 1009)
+
+    def test_events_of_one_time_are_all_in_the_window_or_none(self):
+        t_us = np.array([0, 40, 40, 40, 60, 60, 60, 90])
+        start, stop = window_range(t_us, 50, 4, WINDOW)
+        assert t_us[start:stop].tolist() == [40, 40, 40, 60, 60, 60]
 
     def test_no_events_give_an_empty_window(self):
         assert window_range(np.empty(0, np.int64), 5, 10, WINDOW) == (0, 0)
@@ -230,6 +236,21 @@ class TestRotationCompensation:
         frame, _ = self.compensated(np.empty(0, np.int64), slot_us=500)
         assert frame.compensated_px.shape == (0, 2)
         assert list(event_images(frame, DetectConfig())) == []
+
+
+class TestFixedOrder:
+    @settings(max_examples=50, deadline=None)
+    @given(st.integers(0, 100), st.sampled_from([1, 3, 40]), st.integers(0, 1_000))
+    def test_events_of_one_time_are_ordered_by_pixel_and_polarity(self, count, times, draw):
+        rng = np.random.default_rng(draw)
+        t_us = np.sort(rng.integers(0, times, count))
+        x, y = rng.integers(0, 4, count), rng.integers(65_530, 65_536, count)
+        polarity = rng.choice([-1, 1], count)
+        order = frames_kernels.fixed_order(
+            t_us, x.astype(np.uint16), y.astype(np.uint16), polarity.astype(np.int8)
+        )
+        rows = np.column_stack([t_us, y, x, polarity])
+        np.testing.assert_array_equal(rows[order], rows[np.lexsort([polarity, x, y, t_us])])
 
 
 class TestUndistortion:
