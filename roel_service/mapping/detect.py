@@ -15,12 +15,15 @@ import numpy as np
 
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import DetectConfig
+from roel_service.errors import ConfigError
 from roel_service.mapping import detect_kernels
 from roel_service.mapping.frames import UNKNOWN_POLARITY
 from roel_service.mapping.representations import EventImage
 
 # OpenCV's LSD at its default scale of 0.8 puts lines this far to the upper left (px).
 LSD_OFFSET_PX = -0.125
+# Every OpenCV wheel writes into the folder cv2; what was installed last stays.
+REMEDY = "pip install --force-reinstall --no-deps opencv-contrib-python-headless brings it back"
 # Shortest chain of edge pixels that EDLines looks at.
 MIN_PATH_PX = 10
 
@@ -53,6 +56,14 @@ class EDLines:
     """Edge Drawing Lines (Akinlar and Topal, 2011), as OpenCV implements it."""
 
     def __init__(self, config: DetectConfig) -> None:
+        """Take the settings of the configuration.
+
+        Raises:
+            ConfigError: another OpenCV wheel has overwritten the one that brings EDLines.
+        """
+        if not hasattr(getattr(cv2, "ximgproc", None), "createEdgeDrawing"):
+            expected = f"an OpenCV with edlines; {REMEDY}"
+            raise ConfigError("detect.detector", expected, "cv2 of another OpenCV package")
         self._params = cv2.ximgproc.EdgeDrawing.Params()
         self._params.EdgeDetectionOperator = cv2.ximgproc.EDGE_DRAWING_SOBEL
         self._params.GradientThresholdValue = config.gradient_threshold

@@ -11,6 +11,7 @@ from google.longrunning import operations_pb2
 from google.protobuf.empty_pb2 import Empty
 
 from roel_service.config.stages import Config
+from roel_service.errors import ConfigError
 from roel_service.jobs.inputs import BuildParameters
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.jobs.task import TaskSpec
@@ -64,7 +65,7 @@ class MapServicer:
     ) -> operations_pb2.Operation:
         map_id = names.map_id(request.parent)
         stream_id = names.event_stream_id(request.event_stream)
-        config = config_from_proto(request.config, request.preset or DEFAULT_PRESET)
+        config = _requested_config(request)
         record = await self._scheduler.submit(partial(self._begin, map_id, stream_id, config))
         return operation_to_proto(record, None)
 
@@ -118,3 +119,16 @@ class MapServicer:
         )
         entrypoint = self._settings.build_entrypoint
         return operation, TaskSpec(entrypoint=entrypoint, parameters=parameters)
+
+
+def _requested_config(request: maps_pb2.BuildMapRequest) -> Config:
+    """The configuration of a build.
+
+    Raises:
+        ConfigError: of `config_from_proto`; a file is named: the server would open its own.
+    """
+    config = config_from_proto(request.config, request.preset or DEFAULT_PRESET)
+    if config.match_global.checkpoint:
+        expected = "none on a server, which opens no files that a client names"
+        raise ConfigError("match_global.checkpoint", expected, config.match_global.checkpoint)
+    return config

@@ -1,3 +1,5 @@
+import types
+
 import cv2
 import numpy as np
 import pytest
@@ -5,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from roel_service.config.stages import DetectConfig
+from roel_service.errors import ConfigError
 from roel_service.geometry import segments
 from roel_service.mapping.detect import LSD, EDLines, detect_lines, line_detector, merge_seeds
 from roel_service.mapping.representations import EventImage
@@ -79,6 +82,18 @@ class TestEDLines(LineDetectorContract):
         faint = (grey // 8).astype(np.uint8)
         assert len(EDLines(DetectConfig()).detect(faint)) == 1
         assert len(EDLines(DetectConfig(**changes)).detect(faint)) == 0
+
+    @pytest.mark.parametrize("rest", [None, types.ModuleType("ximgproc")])
+    def test_an_opencv_without_edlines_is_told_with_its_remedy(self, monkeypatch, rest):
+        # What another wheel leaves behind: no module, or its folder alone.
+        monkeypatch.setattr(cv2, "ximgproc", rest)
+        with pytest.raises(ConfigError) as caught:
+            EDLines(DetectConfig())
+        assert str(caught.value) == (
+            "detect.detector: expected an OpenCV with edlines; pip install --force-reinstall "
+            "--no-deps opencv-contrib-python-headless brings it back, found cv2 of another "
+            "OpenCV package"
+        )
 
     def test_a_bent_edge_is_one_line_when_the_fit_may_be_loose(self):
         row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]

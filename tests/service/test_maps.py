@@ -118,6 +118,15 @@ def test_a_configuration_that_cannot_be_is_refused_at_once(call, map_name, strea
     assert call("GetMap", maps_pb2.GetMapRequest(name=map_name)).version_count == 0
 
 
+def test_a_client_cannot_make_the_server_open_a_file(call, map_name, stream):
+    config = config_pb2.MappingConfig()
+    config.match_global.checkpoint = "/etc/hostname"
+    request = maps_pb2.BuildMapRequest(parent=map_name, event_stream=stream, config=config)
+    with pytest.raises(ConfigError, match=r"checkpoint: expected none on a server.* /etc/hostname"):
+        call("BuildMap", request)
+    assert call("GetMap", maps_pb2.GetMapRequest(name=map_name)).version_count == 0
+
+
 def test_only_a_frozen_recording_with_poses_can_be_mapped(client, map_name):
     config = config_of(QUICK)
     stream = client.create_event_stream(new_id(), CAMERA)
