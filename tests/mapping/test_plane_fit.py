@@ -17,6 +17,7 @@ VOTE = PlaneFitConfig(method="vote")
 RANSAC = PlaneFitConfig(
     method="ransac", candidate_distance_px=10.0, inlier_distance_px=2.0, trial_count=200
 )
+DIRECT = dataclasses.replace(RANSAC, method="direct", trial_count=20, cluster_distance_px=5.0)
 METHODS = pytest.mark.parametrize("config", [VOTE, RANSAC], ids=["vote", "ransac"])
 
 SEGMENT_PX = np.array([[40.0, 30.0], [110.0, 70.0]])
@@ -489,3 +490,95 @@ class TestObservationsOfFrames:
     def test_frames_without_lines_have_no_observations(self, frame_count):
         empty = fit(seeds_at(), DEGENERATE["no event"], VOTE)
         assert len(observations_of_frames([empty] * frame_count)) == 0
+
+
+def rectangle(speed, count=400):
+    """Four edges, each moving along its own normal, that meet in corners; and the edges."""
+    corners = np.array([[40.0, 30.0], [120.0, 30.0], [120.0, 90.0], [40.0, 90.0]])
+    edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    parts = [moving_line_events(edge, speed, count=count, seed=i) for i, edge in enumerate(edges)]
+    return parts, edges
+
+
+class TestDirect:
+    @pytest.mark.parametrize("speed", [-0.06, 0.0, 0.013, 0.3])
+    def test_line_and_speed_are_recovered_without_a_seed(self, speed):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, speed))
+        fitted = fit(seeds_at(), frame, DIRECT)
+        assert len(fitted.segments_px) == 1
+        assert offsets_px(fitted.segments_px[0], SEGMENT_PX) < EXACT_PX
+        assert signed_speed(fitted) == pytest.approx(speed, abs=1e-6)
+
+    def test_ends_follow_from_the_spread_of_the_events(self):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS, count=2_000))
+        fitted = fit(seeds_at(), frame, DIRECT)
+        ends = np.sort(segments.position_along(fitted.segments_px[0], SEGMENT_PX[None]))
+        # The deviation of 2000 uniform draws is known to 1 / sqrt(2000) / sqrt(5) = 1 % of itself,
+        # their mean to 0.6 % of the length.
+        np.testing.assert_allclose(ends, [0, 1], rtol=0, atol=0.03)
+
+    def test_seeds_are_not_used(self):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS))
+        with_seeds, without = (
+            fit(seeds, frame, DIRECT) for seeds in (seeds_at(below(40), SEGMENT_PX), seeds_at())
+        )
+        np.testing.assert_array_equal(with_seeds.segments_px, without.segments_px)
+
+    def test_lines_apart_are_clusters_of_their_own(self):
+        lines = [SEGMENT_PX, below(30), below(-20)]
+        parts = [moving_line_events(line, 0.02, seed=i) for i, line in enumerate(lines)]
+        fitted = fit(seeds_at(), event_frame_of(*parts), DIRECT)
+        assert len(fitted.segments_px) == 3
+        for line in lines:
+            nearest = min(offsets_px(found, line) for found in fitted.segments_px)
+            assert nearest < EXACT_PX
+
+    def test_edges_that_meet_are_one_cluster_of_which_one_edge_is_found(self):
+        """Why the paper lets detected lines guide the fit."""
+        parts, edges = rectangle(0.0)
+        fitted = fit(seeds_at(), event_frame_of(*parts), DIRECT)
+        assert len(fitted.segments_px) == 1
+        assert min(offsets_px(fitted.segments_px[0], edge) for edge in edges) < 1.0
+        guided = fit(seeds_at(*edges), event_frame_of(*parts), RANSAC)
+        assert len(guided.segments_px) == 4
+
+    @pytest.mark.parametrize(
+        "changes",
+        [{"cluster_distance_px": 0.2}, {"cluster_min_event_count": 100}, {"min_inlier_count": 500}],
+    )
+    def test_clusters_are_configured(self, changes):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS))
+        config = dataclasses.replace(DIRECT, **changes)
+        assert len(fit(seeds_at(), frame, config).segments_px) == 0
+
+    def test_a_long_millisecond_tears_a_line_to_pieces(self):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS))
+        config = dataclasses.replace(DIRECT, cluster_time_scale_px_per_ms=50.0)
+        assert len(fit(seeds_at(), frame, config).segments_px) == 0
+
+    def test_events_of_one_time_are_no_moving_line(self):
+        xy_px, _, polarity = moving_line_events(SEGMENT_PX, 0.0, noise_px=0.3)
+        frame = event_frame_of((xy_px, np.zeros(len(xy_px)), polarity))
+        assert len(fit(seeds_at(), frame, DIRECT).segments_px) == 0
+
+    @pytest.mark.parametrize("place", [np.nan, 50.0])
+    def test_without_a_cluster_there_is_no_line(self, place):
+        frame = event_frame_of((np.full((1, 2), place), np.zeros(1), np.ones(1)))
+        assert len(fit(seeds_at(), frame, DIRECT).segments_px) == 0
+
+
+class TestNone:
+    def test_lines_stay_as_they_were_detected(self):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS))
+        seeds = seeds_at(beside(SEGMENT_PX, 1.5), below(2.0), polarity=[1, 0])
+        fitted = fit(seeds, frame, PlaneFitConfig(method="none"))
+        np.testing.assert_array_equal(fitted.segments_px, seeds.segments_px)
+        np.testing.assert_array_equal(fitted.polarity, [1, 0])
+        np.testing.assert_array_equal(fitted.normal_speed_px_per_ms, [0, 0])
+
+    def test_no_event_supports_them(self):
+        frame = event_frame_of(moving_line_events(SEGMENT_PX, SPEED_PX_PER_MS))
+        fitted = fit(seeds_at(SEGMENT_PX, below(2.0)), frame, PlaneFitConfig(method="none"))
+        np.testing.assert_array_equal(fitted.event_offsets, [0, 0, 0])
+        assert fitted.event_xy_px.shape == (0, 2)
+        assert len(observations_of_frames([fitted])) == 2

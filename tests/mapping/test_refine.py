@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from roel_service.config.stages import RefineConfig
-from roel_service.geometry import plucker, segments
+from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import skew
 from roel_service.mapping.refine import _Problem, _State, refine_lines
 from roel_service.scene.lines import InfiniteLines, LineTracks
@@ -23,7 +23,27 @@ GRASSMANN = RefineConfig(
     max_residual_px=1e6,
     iteration_count=12,
 )
-RESIDUALS = pytest.mark.parametrize("config", [PIXEL, GRASSMANN], ids=["pixel", "grassmann"])
+# As in LIMAP: no events, weights in proportion to the length.
+REPROJECTION = RefineConfig(
+    residual="reprojection",
+    loss="cauchy",
+    loss_scale_px=1.0,
+    event_weight=0.0,
+    max_length_weight_px=1e6,
+    max_residual_px=20.0,
+    iteration_count=12,
+)
+RESIDUALS = pytest.mark.parametrize(
+    "config", [PIXEL, GRASSMANN, REPROJECTION], ids=["pixel", "grassmann", "reprojection"]
+)
+QUARTIC = [
+    dataclasses.replace(config, loss="quartic") for config in (PIXEL, GRASSMANN, REPROJECTION)
+]
+# With events, and with every term squared once more.
+COSTS = pytest.mark.parametrize(
+    "config",
+    [PIXEL, GRASSMANN, REPROJECTION, dataclasses.replace(REPROJECTION, event_weight=1.0), *QUARTIC],
+)
 
 
 def refined(world, lines=None, tracks=None, config=PIXEL):
@@ -34,6 +54,13 @@ def refined(world, lines=None, tracks=None, config=PIXEL):
         world.frames,
         config,
     )
+
+
+def start_of(problem, lines):
+    """The lines as the first step sees them."""
+    moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
+    U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
+    return _State(U=U, phi=phi)
 
 
 class TestExact:
@@ -96,7 +123,7 @@ class TestExact:
 class TestGradient:
     """The gradient is that of half the cost, in the tangent of the orthonormal form."""
 
-    @RESIDUALS
+    @COSTS
     @settings(max_examples=10, deadline=None)
     @given(st.integers(0, 10_000), st.sampled_from([1.0, 100.0]))
     def test_it_agrees_with_central_differences_of_the_cost(self, config, draw, scale):
@@ -157,6 +184,111 @@ class TestGradient:
         size = np.abs(hessian).max(axis=(1, 2), keepdims=True)
         # Gauss-Newton is exact where residuals vanish.
         assert (np.abs(numeric - hessian) < 1e-5 * size).all()
+
+
+class TestQuartic:
+    """The other reading of the published cost: every squared residual is squared."""
+
+    @pytest.mark.parametrize(
+        ("config", "weight"),
+        [
+            (PIXEL, "form_weight"),
+            (REPROJECTION, "weight"),
+            (dataclasses.replace(GRASSMANN, event_weight=0.0), "weight"),
+            # Without its lines.
+            (dataclasses.replace(GRASSMANN, max_length_weight_px=1e-30), "form_weight"),
+        ],
+        ids=["pixel", "reprojection", "published lines", "published events"],
+    )
+    def test_it_is_the_square_of_each_term(self, config, weight):
+        noisy = world(noise_px=0.5, event_noise_px=0.5)
+        lines = noisy.lines.take(noisy.line_of)
+        tracks = LineTracks.from_lists([[row] for row in range(len(lines))])
+        costs = []
+        for loss in ("squared", "quartic"):
+            reading = dataclasses.replace(config, loss=loss)
+            problem = _Problem(lines, tracks, noisy.evidence(config), noisy.frames, reading)
+            costs.append(problem.cost(start_of(problem, lines), np.ones(len(lines))))
+        np.testing.assert_allclose(getattr(problem, weight) * costs[1], costs[0] ** 2, rtol=1e-12)
+
+    @pytest.mark.parametrize("config", QUARTIC, ids=["pixel", "grassmann", "reprojection"])
+    def test_lines_come_closer_with_every_step(self, config):
+        exact = world()
+        start = perturbed(exact.lines, 0.01, 0.01)
+        errors = [
+            line_errors(
+                refined(
+                    exact, start, config=dataclasses.replace(config, iteration_count=count)
+                ).lines,
+                exact.segments,
+            )[:, 0].max()
+            for count in (1, 12, 40)
+        ]
+        # Newton's method on a fourth power takes a third of the way at each step.
+        assert errors[1] < 0.1 * errors[0]
+        assert errors[2] < 1e-3 * errors[0]
+
+    def test_the_largest_residual_weighs_most(self):
+        noisy = world(noise_px=0.3)
+        largest = []
+        for loss in ("squared", "quartic"):
+            config = dataclasses.replace(
+                REPROJECTION, loss=loss, max_length_weight_px=1.0, iteration_count=40
+            )
+            found = refined(noisy, config=config)
+            problem = _Problem(
+                found.lines, noisy.tracks, noisy.evidence(config), noisy.frames, config
+            )
+            ends = np.abs(problem._end_distances_px(start_of(problem, found.lines)))
+            largest.append(np.maximum.reduceat(ends.max(axis=1), noisy.tracks.offsets[:-1]))
+        assert (largest[1] < largest[0] + 1e-6).mean() > 0.9
+
+
+class TestReprojection:
+    """The lines are the true ones, so that distances follow from the true segments' images."""
+
+    NOISY = world(noise_px=0.5)
+
+    def problem(self):
+        noisy = self.NOISY
+        return _Problem(
+            noisy.lines, noisy.tracks, noisy.evidence(REPROJECTION), noisy.frames, REPROJECTION
+        )
+
+    def squared_px(self):
+        """(M,) squared distances of both ends together."""
+        noisy = self.NOISY
+        T_camera_world = noisy.frames.T_world_camera[noisy.observations.frame].inverse()
+        in_camera = T_camera_world[:, None] @ noisy.segments[noisy.line_of]
+        images = projection.project(in_camera, noisy.frames.K)
+        ends = segments.point_line_offset(noisy.observations.segments_px, images[:, None])
+        return np.sum(ends**2, axis=1)
+
+    def test_cost_is_that_of_the_distances_in_the_image(self):
+        problem, observations = self.problem(), self.NOISY.observations
+        rows = segments.length(observations.segments_px) * self.squared_px()
+        expected = np.bincount(self.NOISY.line_of, rows) / REPROJECTION.max_length_weight_px
+        state = start_of(problem, self.NOISY.lines)
+        np.testing.assert_allclose(problem.cost(state, np.ones(len(rows))), expected, rtol=1e-9)
+
+    def test_its_loss_is_that_of_both_ends_together(self):
+        problem = self.problem()
+        state = start_of(problem, self.NOISY.lines)
+        weight = problem.robust_weight(state, problem.residual_px(state))
+        expected = 1 / (1 + self.squared_px()[problem.observation])
+        np.testing.assert_allclose(weight, expected, rtol=1e-9)
+
+
+class TestNoSteps:
+    @pytest.mark.parametrize("config", [PIXEL, GRASSMANN, REPROJECTION, *QUARTIC])
+    def test_lines_stay_as_they_were(self, config):
+        exact = world()
+        start = perturbed(exact.lines, 0.002, 0.002)
+        found = refined(exact, start, config=dataclasses.replace(config, iteration_count=0))
+        # To the orthonormal form about the line's own origin, and back.
+        np.testing.assert_allclose(found.lines.direction, start.direction, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.lines.moment, start.moment, rtol=0, atol=1e-12)
+        assert not found.diverged.any()
 
 
 class TestNoise:
@@ -336,7 +468,7 @@ class TestDegenerate:
         )
         found = refined(exact, start, LineTracks.from_lists([track]), config)
         assert np.isfinite(found.lines.moment).all()
-        # The gate leaves nothing of it; the published cost has no gate.
+        # The gate leaves nothing of it; those of the others are wide.
         np.testing.assert_array_equal(found.diverged, [config is PIXEL])
 
     @RESIDUALS
