@@ -42,6 +42,8 @@ POSED_RECORDINGS = ("slider_depth", "events_room01")
 POSELESS_RECORDINGS = ("boxes", "disk", "stripes", "building")
 # Small enough for a test, large enough for some lines.
 TINY_ROOM = "sim_1_173x130_1s"
+# Smaller still; its lines go through every stage all the same.
+WARM_UP_ROOM = "sim_1_120x90_0.4s"
 
 SIMULATED_NAME = re.compile(
     r"sim_(?P<seed>\d{1,9})_(?P<width>\d{2,4})x(?P<height>\d{2,4})_(?P<seconds>\d{1,3}(\.\d)?)s"
@@ -64,23 +66,36 @@ class Places:
     rooms: Path
 
 
+# Opens a scene; a simulated one is made first if need be.
+Opener = Callable[[ProgressCallback], Scene]
+
+
+def find_scene(name: str, places: Places) -> Opener:
+    """How to open the scene of that name.
+
+    Raises:
+        InputError: no scene of that name, or no folder to find it in.
+    """
+    if simulated := SIMULATED_NAME.fullmatch(name):
+        return lambda progress: _simulated(name, simulated, places.rooms, progress)
+    if name.startswith("folder:"):
+        return lambda progress: _folder(name, Path(name.removeprefix("folder:")), is_tuning=False)
+    if name not in RECORDINGS:
+        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH"])
+        raise InputError("scene", f"one of {known}", repr(name))
+    data = places.data
+    if data is None:
+        raise InputError(name, "a folder of recordings (--data or ROEL_DATA)", "none")
+    return lambda progress: RECORDINGS[name](name, data)
+
+
 def open_scene(name: str, places: Places, progress: ProgressCallback) -> Scene:
     """The scene of that name, simulated first if need be.
 
     Raises:
-        InputError: no scene of that name, a folder that is not there, or files of it that cannot
-            be used.
+        InputError: as `find_scene`, or files of it that cannot be used.
     """
-    if simulated := SIMULATED_NAME.fullmatch(name):
-        return _simulated(name, simulated, places.rooms, progress)
-    if name.startswith("folder:"):
-        return _folder(name, Path(name.removeprefix("folder:")), is_tuning=False)
-    if name not in RECORDINGS:
-        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH"])
-        raise InputError("scene", f"one of {known}", name)
-    if places.data is None:
-        raise InputError(name, "a folder of recordings (--data or ROEL_DATA)", "none")
-    return RECORDINGS[name](name, places.data)
+    return find_scene(name, places)(progress)
 
 
 def _simulated(

@@ -129,6 +129,8 @@ def _acceptance(report: _Report) -> str:
 
 
 def _mark(criterion: Criterion, found: Sequence[float | None]) -> str:
+    if criterion.bound == MISSING:
+        return ""
     known = [value for value in found if value is not None]
     if not known:
         return "not run"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from roel_bench import memory
-from roel_bench.catalogue import TINY_ROOM, Places, open_scene
+from roel_bench.catalogue import WARM_UP_ROOM, Places, find_scene, open_scene
 from roel_bench.disturbances import DISTURBANCES
 from roel_bench.front_end import (
     FRAME_STRIDE,
@@ -67,19 +67,22 @@ class Runner:
         """Run the cells that the folder has no row of yet.
 
         Raises:
-            InputError: a folder that cannot be written, or that holds something else; a scene
-                that cannot be opened.
+            InputError: an unknown scene; a folder that cannot be written, or that holds results
+                of another machine; a scene that cannot be opened.
+            ConfigError: an unknown method.
         """
         cells = list(cells)
+        openers = {name: find_scene(name, self.places) for name in {c.scene for c in cells}}
+        keys = [_key(cell) for cell in cells]
         results = self._results()
         scene: Scene | None = None
         truths = _FrameTruths()
-        for index, cell in enumerate(cells):
-            if _key(cell) in {row.key for row in results.rows}:
+        for index, (cell, key) in enumerate(zip(cells, keys, strict=True)):
+            if key in {row.key for row in results.rows}:
                 continue
             step = self._step(cell, index, len(cells))
             if scene is None or scene.name != cell.scene:
-                scene = open_scene(cell.scene, self.places, step)
+                scene = openers[cell.scene](step)
             try:
                 row = self._row(cell, scene, truths, step)
             except NotFoundError as error:
@@ -194,7 +197,7 @@ class Runner:
         if cell.method in self._warm:
             return
         self._warm.add(cell.method)
-        room = open_scene(TINY_ROOM, self.places, ignore)
+        room = open_scene(WARM_UP_ROOM, self.places, ignore)
         if cell.task == FRONT_END:
             config = find_variant(cell.method).config
             run_front_end(room, config, None, lambda done, total: None, FRAME_STRIDE)

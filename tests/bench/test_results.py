@@ -1,0 +1,66 @@
+import json
+import math
+from dataclasses import replace
+
+import pytest
+
+from roel_bench.results import (
+    Results,
+    config_digest,
+    read_results,
+    this_machine,
+    write_results,
+)
+from roel_service.config.load import with_tables
+from roel_service.config.presets import preset
+from roel_service.errors import InputError
+from tests.bench.samples import row
+
+EMPTY = Results(machine={"core_count": 2}, versions={"numpy": "2"})
+
+
+def test_results_read_back_as_written(tmp_path):
+    results = EMPTY.with_row(row(figures={"iou_20": 0.5, "accuracy_mm": None}))
+    write_results(tmp_path / "a.json", results)
+    assert read_results(tmp_path / "a.json") == results
+
+
+def test_figures_are_written_with_six_digits_and_without_nan(tmp_path):
+    results = EMPTY.with_row(row(figures={"iou_20": 1 / 3, "bias": math.nan, "count": 1234567}))
+    write_results(tmp_path / "a.json", results)
+    figures = json.loads((tmp_path / "a.json").read_text())["rows"][0]["figures"]
+    assert figures == {"iou_20": 0.333333, "bias": None, "count": 1234567}
+
+
+def test_a_row_takes_the_place_of_the_older_one_of_its_key():
+    first = row(figures={"iou_20": 0.1})
+    other = row(method="paper")
+    again = replace(first, figures={"iou_20": 0.2})
+    results = EMPTY.with_row(first).with_row(other).with_row(again)
+    assert results.rows == (other, again)
+
+
+def test_digest_follows_parameters_but_not_the_runtime():
+    default = preset("default")
+    other = with_tables(default, {"refine": {"event_weight": 0.5}}, subject="sample")
+    workers = with_tables(default, {"runtime": {"worker_count": 3}}, subject="sample")
+    assert config_digest(default) == config_digest(workers) != config_digest(other)
+
+
+def test_milliseconds_a_frame_are_of_all_stages():
+    assert row().ms_per_frame == 100.0
+    assert row(frame_count=0).ms_per_frame is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "x"}'])
+def test_other_files_are_no_results(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=r"a\.json"):
+        read_results(tmp_path / "a.json")
+
+
+def test_machine_is_described():
+    machine = this_machine()
+    assert machine.machine["core_count"] >= 1
+    assert machine.versions["roel_service"]
+    assert machine.rows == ()

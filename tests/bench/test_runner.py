@@ -1,0 +1,103 @@
+from dataclasses import replace
+
+import pytest
+
+from roel_bench.catalogue import WARM_UP_ROOM, Places
+from roel_bench.methods import find_method
+from roel_bench.results import FILE_NAME, Results, read_results, write_results
+from roel_bench.runner import Runner
+from roel_bench.suites import FRONT_END, MAP, Cell
+from roel_service.errors import InputError
+from roel_service.progress import Progress
+from tests.bench.samples import row
+
+CELLS = [
+    Cell(task=MAP, scene=WARM_UP_ROOM, method="default"),
+    Cell(task=MAP, scene=WARM_UP_ROOM, method="default", disturbance="noise_events"),
+    Cell(task=FRONT_END, scene=WARM_UP_ROOM, method="default"),
+]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    return Places(data=None, rooms=tmp_path_factory.mktemp("rooms"))
+
+
+@pytest.fixture(scope="module")
+def folder(places, tmp_path_factory):
+    """A run of all cells."""
+    folder = tmp_path_factory.mktemp("run")
+    Runner(places=places, folder=folder).run(CELLS)
+    return folder
+
+
+def test_every_cell_has_its_row(folder):
+    rows = read_results(folder / FILE_NAME).rows
+    assert [(row.task, row.disturbance, row.method) for row in rows] == [
+        (cell.task, cell.disturbance, cell.method) for cell in CELLS
+    ]
+    clean, noisy, frames = rows
+    assert noisy.event_count > clean.event_count
+    assert 0 <= clean.figures["iou_20"] < 1
+    assert clean.frame_count >= 24
+    assert clean.ms_per_frame > 0
+    assert clean.seconds.keys() > {"detect", "plane_fit", "trim"}
+    assert 0 < frames.figures["f_score"] < 1
+    assert all(row.config_digest == find_method("default").digest for row in rows)
+
+
+def test_pictures_are_of_what_is_not_disturbed(folder):
+    pictures = sorted(path.name for path in (folder / "pictures").iterdir())
+    assert pictures == [
+        f"front_end_{WARM_UP_ROOM}_default.png",
+        f"map_{WARM_UP_ROOM}_default.png",
+    ]
+    assert all(
+        (folder / "pictures" / name).read_bytes().startswith(b"\x89PNG") for name in pictures
+    )
+
+
+def test_rows_that_are_there_are_not_run_again(folder, places):
+    before = (folder / FILE_NAME).stat().st_mtime_ns
+    told: list[Progress] = []
+    results = Runner(places=places, folder=folder, progress=told.append).run(CELLS)
+    assert len(results.rows) == len(CELLS)
+    assert told == []
+    assert (folder / FILE_NAME).stat().st_mtime_ns == before
+
+
+def test_an_interrupted_run_goes_on(folder, places, tmp_path):
+    done = read_results(folder / FILE_NAME)
+    write_results(tmp_path / FILE_NAME, replace(done, rows=done.rows[:2]))
+    told: list[Progress] = []
+    results = Runner(places=places, folder=tmp_path, progress=told.append).run(CELLS)
+    assert results.rows[:2] == done.rows[:2]
+    assert len(results.rows) == 3
+    assert {progress.stage for progress in told} == {f"{WARM_UP_ROOM} default"}
+    fractions = [progress.fraction for progress in told]
+    assert fractions == sorted(fractions)
+    assert min(fractions) >= 2 / 3
+
+
+def test_results_of_another_machine_are_not_mixed_with(places, tmp_path):
+    other = Results(machine={"core_count": 1000}, versions={}).with_row(row())
+    write_results(tmp_path / FILE_NAME, other)
+    with pytest.raises(InputError, match="this machine"):
+        Runner(places=places, folder=tmp_path).run(CELLS)
+    assert read_results(tmp_path / FILE_NAME) == other
+
+
+def test_a_folder_that_cannot_be_written(places, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(InputError, match="a folder to write to"):
+        Runner(places=places, folder=tmp_path / "file").run(CELLS)
+
+
+@pytest.mark.parametrize("wrong", [{"scene": "nope"}, {"method": "nope"}])
+def test_unknown_names_are_told_before_anything_runs(places, tmp_path, wrong):
+    told: list[Progress] = []
+    cells = [CELLS[0], replace(CELLS[0], **wrong)]
+    with pytest.raises(InputError, match="'nope'"):
+        Runner(places=places, folder=tmp_path / "new", progress=told.append).run(cells)
+    assert told == []
+    assert not (tmp_path / "new").exists()
