@@ -46,6 +46,7 @@ PAPER = Config(
         event_weight=1e4,
         event_count_per_line=50,
         max_length_weight_px=UNLIMITED,
+        direction_sigma_deg=0.0,
         max_residual_px=20.0,
     ),
     trim=TrimConfig(

@@ -241,7 +241,7 @@ class MatchGlobalConfig(Stage, table="match_global"):
     min_point_match_count: int = parameter(11, POSITIVE)
     point_distance_px: float = parameter(10.0, POSITIVE)
     min_epipolar_score: float = parameter(0.3, SHARE)
-    max_distances_px: tuple[float, ...] = parameter((1.5, 1.3, 1.1), SOME_POSITIVE)
+    max_distances_px: tuple[float, ...] = parameter((1.5, 1.1, 1.1), SOME_POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
     max_shared_fraction: float = parameter(0.9, SHARE)
@@ -307,6 +307,11 @@ class RefineConfig(Stage, table="refine"):
         event_weight: weight of the event term against the line term; its unit follows `residual`.
         event_count_per_line: supporting events used an observation, nearest in time; 0 uses all.
         max_length_weight_px: observations longer than this weigh no more.
+        direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
+            refines every line on its own.
+        direction_noise_px: noise of an observation as a whole, for the uncertainty of directions.
+        max_direction_distance: a line this many standard deviations from a shared direction, or
+            fewer, is held to it.
         iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as triangulated.
         max_residual_px: observations beyond it are left out of the next step.
         min_inlier_count: a line with fewer has diverged.
@@ -318,6 +323,9 @@ class RefineConfig(Stage, table="refine"):
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
+    direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
+    direction_noise_px: float = parameter(0.5, POSITIVE)
+    max_direction_distance: float = parameter(3.0, POSITIVE)
     iteration_count: int = parameter(8, UP_TO_1000)
     max_residual_px: float = parameter(2.0, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
@@ -351,7 +359,7 @@ class TrimConfig(Stage, table="trim"):
     end_cluster_px: float = parameter(5.0, POSITIVE)
     max_sigma_m: float = parameter(0.1, POSITIVE)
     max_rms_px: float = parameter(0.65, POSITIVE)
-    min_support_ratio: float = parameter(0.4, SHARE)
+    min_support_ratio: float = parameter(0.3, SHARE)
     min_frame_count: int = parameter(8, POSITIVE)
     overlap_distance_m: float = parameter(0.012, NOT_NEGATIVE)
     overlap_angle_deg: float = parameter(4.0, NOT_NEGATIVE)

@@ -11,11 +11,12 @@ import numpy as np
 from scipy import sparse
 
 from roel_service.arrays import FloatArray
-from roel_service.config.stages import Config, MatchGlobalConfig
+from roel_service.config.stages import Config, MatchGlobalConfig, RefineConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
+from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.refine import Refined, refine_lines
@@ -48,7 +49,10 @@ def reassociate(
     config: Config,
     progress: StepCallback,
 ) -> Refined:
-    """Let lines collect their observations from all frames, in rounds; then make them exclusive.
+    """Let lines collect their observations from all frames, in rounds.
+
+    In a round lines may share observations while they grow; at its end each observation goes to the
+    line that it fits best.
 
     Args:
         refined: first lines with their tracks.
@@ -66,10 +70,19 @@ def reassociate(
         found = _associate(
             refined, evidence.views, observations, frames, velocity, max_distance_px, settings
         )
-        refined = _usable(refine_lines(refined.lines, found, evidence, frames, config.refine))
+        refined = _held(refined, found, evidence, frames, config.refine)
         refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
-    exclusive = _exclusive(refined, evidence.views, frames)
-    return _usable(refine_lines(refined.lines, exclusive, evidence, frames, config.refine))
+        exclusive = _exclusive(refined, evidence.views, frames)
+        refined = _held(refined, exclusive, evidence, frames, config.refine)
+    return refined
+
+
+def _held(
+    refined: Refined, tracks: LineTracks, evidence: Evidence, frames: Frames, config: RefineConfig
+) -> Refined:
+    """The lines refined over other tracks, held by the directions that they share so far."""
+    prior = direction_prior(refined, config)
+    return _usable(refine_lines(refined.lines, tracks, evidence, frames, config, prior))
 
 
 def _usable(refined: Refined) -> Refined:

@@ -28,7 +28,7 @@ def facing_share(segment: Array, line: Array) -> float:
     overlap = min(max(a, b), 1.0) - max(min(a, b), 0.0)
     length = np.sqrt(squared)
     sx, sy = segment[1, 0] - segment[0, 0], segment[1, 1] - segment[0, 1]
-    return overlap * length / min(length, np.sqrt(sx * sx + sy * sy))
+    return float(overlap * length / min(length, np.sqrt(sx * sx + sy * sy)))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -13,6 +13,7 @@ from roel_service.config.stages import Config, RefineConfig
 from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
 from roel_service.mapping.detect import LineDetector, detect_lines, line_detector
+from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence, measure_evidence
 from roel_service.mapping.frames import (
     Frames,
@@ -114,8 +115,9 @@ def build_line_map(
                 refined, evidence, observations, frames, trajectory, config, run.step
             )
     with run.stage("refine"):
+        prior = direction_prior(refined, config.refine)
         refined = run.without_diverged(
-            refine_lines(refined.lines, refined.tracks, evidence, frames, config.refine)
+            refine_lines(refined.lines, refined.tracks, evidence, frames, config.refine, prior)
         )
     with run.stage("trim"):
         line_map, dropped = trim_to_segments(refined, evidence.views, frames, config.trim)

@@ -44,6 +44,9 @@ MAX_TURN_RAD = 0.2
 # In the first steps outliers may lie this much farther out than later.
 FIRST_GATE = 1.5
 LOOSE_ITERATION_COUNT = 2
+# Information that no observation gives, as a share of the whole: above float64's rounding, so that
+# what nothing tells is very uncertain, not certain.
+LEAST_INFORMATION = 1e-14
 # Keeps the 4x4 systems of lines regular that no observation holds in some direction.
 RIDGE = 1e-12
 
@@ -82,6 +85,35 @@ class Refined:
             information=self.information[lines],
             diverged=self.diverged[lines],
         )
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(L, 4, 4) in the orthonormal tangent about the origin, for 1 px of noise.
+
+        The noise is that of an observation as a whole; measured errors are smaller.
+        """
+        whole = np.trace(self.information, axis1=-2, axis2=-1)[:, None, None]
+        return np.linalg.inv(self.information + LEAST_INFORMATION * whole * np.eye(4))
+
+    def jacobians(self) -> tuple[FloatArray, FloatArray]:
+        """(L, 3, 4) derivatives of direction, and of the moment about the origin, by the tangent."""
+        moment = plucker.shift_origin(self.lines.direction, self.lines.moment, self.origin)
+        return plucker.plucker_jacobians(
+            *plucker.orthonormal_from_plucker(self.lines.direction, moment)
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DirectionPrior:
+    """Directions that lines are pulled to.
+
+    Attributes:
+        direction: (L, 3) unit vectors, world; any where the weight is 0.
+        weight: (L,) px^2/rad^2, of the squared sine between line and direction.
+    """
+
+    direction: FloatArray
+    weight: FloatArray
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -122,8 +154,10 @@ class _Problem:
         evidence: Evidence,
         frames: Frames,
         config: RefineConfig,
+        prior: DirectionPrior | None = None,
     ) -> None:
         self.config = config
+        self.prior = prior
         self.quartic = config.loss == "quartic"
         self.K = frames.K
         self.focal_px = frames.focal_px
@@ -196,16 +230,20 @@ class _Problem:
     def cost(self, state: _State, weight: FloatArray) -> FloatArray:
         """(L,) with fixed (S,) robust weights."""
         cost = self._form_cost(state, weight * self.form_weight)
-        if self.config.residual == "pixel":
-            return cost
-        return cost + self._line_system(state, weight * self.weight).cost
+        if self.config.residual != "pixel":
+            cost = cost + self._line_system(state, weight * self.weight).cost
+        if self.prior is not None:
+            cost = cost + _prior_system(state, self.prior).cost
+        return cost
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Cost, gradient and Gauss-Newton Hessian with fixed (S,) robust weights."""
-        forms = self._form_system(state, weight * self.form_weight)
-        if self.config.residual == "pixel":
-            return forms
-        return forms + self._line_system(state, weight * self.weight)
+        system = self._form_system(state, weight * self.form_weight)
+        if self.config.residual != "pixel":
+            system = system + self._line_system(state, weight * self.weight)
+        if self.prior is not None:
+            system = system + _prior_system(state, self.prior)
+        return system
 
     def _form_cost(self, state: _State, weight: FloatArray) -> FloatArray:
         """(L,) sum w e with e = y^T G y / |m_c|^2, or w e^2."""
@@ -316,12 +354,26 @@ class _Problem:
         return self.total(np.nan_to_num(middles)) / np.maximum(counts, 1.0)
 
 
+def _prior_system(state: _State, prior: DirectionPrior) -> _System:
+    """Of sum w |v x d|^2, the squared sine between line and direction."""
+    v, _ = state.plucker
+    dv, _ = plucker.plucker_jacobians(state.U, state.phi)
+    r = np.cross(v, prior.direction)
+    J = np.cross(dv, prior.direction[..., None], axisa=-2, axisb=-2, axisc=-2)
+    return _System(
+        cost=prior.weight * dot(r, r),
+        gradient=prior.weight[:, None] * np.einsum("lij,li->lj", J, r),
+        hessian=prior.weight[:, None, None] * np.swapaxes(J, -1, -2) @ J,
+    )
+
+
 def refine_lines(
     lines: InfiniteLines,
     tracks: LineTracks,
     evidence: Evidence,
     frames: Frames,
     config: RefineConfig,
+    prior: DirectionPrior | None = None,
 ) -> Refined:
     """Refine every line over its observations; the poses stay as they are.
 
@@ -331,8 +383,9 @@ def refine_lines(
         evidence: of all observations.
         frames: poses and calibration.
         config: cost, loss, gates and number of steps.
+        prior: directions that lines are held to, see `directions`.
     """
-    problem = _Problem(lines, tracks, evidence, frames, config)
+    problem = _Problem(lines, tracks, evidence, frames, config, prior)
     moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
     state = _State(U=U, phi=phi)
@@ -349,7 +402,7 @@ def refine_lines(
     in_pixels = problem
     if config.residual != "pixel" or problem.quartic:
         metric = replace(config, residual="pixel", loss="squared", event_weight=1.0)
-        in_pixels = _Problem(lines, tracks, evidence, frames, metric)
+        in_pixels = _Problem(lines, tracks, evidence, frames, metric, prior)
     information = in_pixels.system(state, weight).hessian
     return _refined(problem, tracks, state, residual_px, inlier, information)
 

@@ -26,9 +26,6 @@ from roel_service.scene.results import TrackStatus
 SPAN_COVERAGE_FRACTION = 0.25
 # Strength of a segment is n sqrt(length) / (this + sigma): below it, sigma does not matter.
 SIGMA_FLOOR_M = 0.01
-# Information that no observation gives, as a share of the whole: above float64's rounding, so that
-# what nothing tells is very uncertain, not certain.
-LEAST_INFORMATION = 1e-14
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -205,11 +202,9 @@ def _sigma_m(refined: Refined, pieces: _Segments) -> FloatArray:
     """
     direction = refined.lines.direction
     moment = plucker.shift_origin(direction, refined.lines.moment, refined.origin)
-    U, phi = plucker.orthonormal_from_plucker(direction, moment)
-    dv, dm = plucker.plucker_jacobians(U, phi)
+    dv, dm = refined.jacobians()
     by_foot = np.cross(dv, moment[..., None], axis=-2) + np.cross(direction[..., None], dm, axis=-2)
-    whole = np.trace(refined.information, axis1=-2, axis2=-1)[:, None, None]
-    covariance = np.linalg.inv(refined.information + LEAST_INFORMATION * whole * np.eye(4))
+    covariance = refined.covariance
     line = pieces.line
     about_origin = pieces.interval_m - dot(direction, refined.origin)[line, None]
     worst: FloatArray = np.zeros(len(line))
