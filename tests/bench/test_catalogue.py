@@ -18,8 +18,8 @@ ROOM = "sim_3_32x24_0.1s"
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory):
-    return Places(data=None, rooms=tmp_path_factory.mktemp("rooms") / "kept")
+def places(rooms):
+    return Places(data=None, rooms=rooms / "of_their_own")
 
 
 def test_rooms_are_simulated_once(places):

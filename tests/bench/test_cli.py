@@ -25,10 +25,9 @@ def test_command_line_knows_every_suite() -> None:
     assert set(SUITES) == set(suites.SUITES)
 
 
-def test_smoke_run_leaves_rows_table_and_pictures(tmp_path: Path) -> None:
-    done = bench(
-        *("--out", "run", "--scenes", WARM_UP_ROOM, "--variants", "default", "--json"), cwd=tmp_path
-    )
+def test_smoke_run_leaves_rows_table_and_pictures(tmp_path: Path, rooms: Path) -> None:
+    names = ("--scenes", WARM_UP_ROOM, "--variants", "default")
+    done = bench("--out", "run", "--rooms", str(rooms), *names, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document == json.loads((tmp_path / "run" / "mapping.json").read_text())
@@ -38,7 +37,6 @@ def test_smoke_run_leaves_rows_table_and_pictures(tmp_path: Path) -> None:
         "mapping.json",
         "mapping.md",
         "pictures",
-        "rooms",
     ]
 
 

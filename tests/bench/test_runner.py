@@ -19,8 +19,8 @@ CELLS = [
 
 
 @pytest.fixture(scope="module")
-def places(tmp_path_factory):
-    return Places(data=None, rooms=tmp_path_factory.mktemp("rooms"))
+def places(rooms):
+    return Places(data=None, rooms=rooms)
 
 
 @pytest.fixture(scope="module")
