@@ -7,17 +7,22 @@
 | `slider_depth`, `events_room01` | real events with poses; events of a photographed room |
 | `boxes`, `disk`, `stripes`, `building` | real events without poses |
 | `folder:PATH` | any recording laid out as `roel simulate` does |
+| `tum_vie:DIR/SEQUENCE`, `vector:DIR/SEQUENCE`, `replica:DIR/SCENE` | see `datasets` |
+
+`tum_vie` and `vector` take a third part, `:POSES`, a file of poses in place of the publisher's.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
+from roel_bench.datasets import open_replica, open_tum_vie, open_vector
 from roel_bench.recordings import read_aedat2, read_event_lifetime
 from roel_bench.scenes import HeldBackEvents, LineTruth, MapTruth, Scene, part_of
 from roel_service.errors import InputError
@@ -80,8 +85,12 @@ def find_scene(name: str, places: Places) -> Opener:
         return lambda progress: _simulated(name, simulated, places.rooms, progress)
     if name.startswith("folder:"):
         return lambda progress: _folder(name, Path(name.removeprefix("folder:")), is_tuning=False)
+    kind, _, place = name.partition(":")
+    if kind in DATASETS and place:
+        return lambda progress: replace(DATASETS[kind](place), name=name)
     if name not in RECORDINGS:
-        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH"])
+        published = [f"{kind}:DIR/SEQUENCE" for kind in DATASETS]
+        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH", *published])
         raise InputError("scene", f"one of {known}", repr(name))
     data = places.data
     if data is None:
@@ -183,6 +192,29 @@ def _poseless(folder: str, file: str, read: Callable[[Path], EventStream]) -> Re
 
     return opened
 
+
+def _published(open_sequence: SequenceOpener) -> Callable[[str], Scene]:
+    """Opens DIR/SEQUENCE, or DIR/SEQUENCE:POSES."""
+
+    def opened(place: str) -> Scene:
+        sequence, _, poses = place.partition(":")
+        path = Path(sequence)
+        return open_sequence(path.parent, path.name, poses=Path(poses) if poses else None)
+
+    return opened
+
+
+class SequenceOpener(Protocol):
+    """A function of `datasets` for sequences with poses that may be replaced."""
+
+    def __call__(self, folder: Path, sequence: str, *, poses: Path | None = None) -> Scene: ...
+
+
+DATASETS: dict[str, Callable[[str], Scene]] = {
+    "tum_vie": _published(open_tum_vie),
+    "vector": _published(open_vector),
+    "replica": lambda place: open_replica(Path(place).parent, Path(place).name),
+}
 
 RecordingOpener = Callable[[str, Path], Scene]
 

@@ -82,6 +82,7 @@ DEFAULT_ABLATION = (
     _without("event term", refine={"event_weight": 0.0}),
     _without("all but 50 events a line", refine={"event_count_per_line": 50}),
     _without("robust loss", refine={"loss": "squared"}),
+    _without("shared directions", refine={"direction_sigma_deg": 0.0}),
     _without("refinement", refine=NO_STEPS),
     _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
     _without("uncertainty filter", trim={"max_sigma_m": UNLIMITED}),

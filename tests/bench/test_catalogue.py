@@ -2,6 +2,7 @@ import shutil
 
 import pytest
 
+from roel_bench import catalogue
 from roel_bench.catalogue import (
     POSED_RECORDINGS,
     POSELESS_RECORDINGS,
@@ -59,6 +60,11 @@ def test_rooms_of_tuning_seeds_are_marked(places):
         ("sim_1_32x24", "one of sim_SEED"),
         ("room_12", "--data or ROEL_DATA"),
         ("folder:/nowhere", "camera.json"),
+        ("vector:", "one of sim_SEED"),
+        ("vector:/nowhere/desk-fast", "/nowhere/"),
+        ("vector:/nowhere/desk-fast:devo.txt", "/nowhere/|devo.txt"),
+        ("tum_vie:/nowhere/mocap-desk", "/nowhere/"),
+        ("replica:/nowhere/office4", "/nowhere/"),
     ],
 )
 def test_scenes_that_are_not_there(places, name, expected):
@@ -86,3 +92,16 @@ def test_truth_of_recordings(data_folder, tmp_path):
     assert isinstance(slider.truth, HeldBackEvents)
     kept = concatenate(list(slider.events.chunks()))
     assert len(slider.truth.events) == pytest.approx(len(kept) / 9, abs=1)
+
+
+def test_published_sequences_are_named_by_folder_and_poses(places, monkeypatch):
+    asked = []
+
+    def opened(place):
+        asked.append(place)
+        return open_scene(ROOM, places, ignore)
+
+    monkeypatch.setitem(catalogue.DATASETS, "vector", opened)
+    scene = open_scene("vector:a/b:c", places, ignore)
+    assert asked == ["a/b:c"]
+    assert scene.name == "vector:a/b:c"
