@@ -16,6 +16,7 @@ from roel_service.mapping.learned import (
     MAX_CHECKPOINT_BYTES,
     LoftrMatcher,
     NetworkImage,
+    load_weights,
     loftr,
     packaged_weights,
     read_checkpoint,
@@ -67,7 +68,7 @@ def shifted_pair(width=346, height=260):
 class TestLightGlueMatchers:
     def test_a_shifted_image_gives_the_shift(self, name, monkeypatch):
         # A quarter of the pixels: seconds instead of half a minute.
-        monkeypatch.setattr(learned, "NETWORK_WIDTH_PX", 320)
+        monkeypatch.setattr(learned, "LONG_SIDE_PX", 320)
         matcher = MATCHERS[name](MatchGlobalConfig(matcher=name))
         features = [matcher.features(image) for image in shifted_pair()]
         matches = matcher.match(*features)
@@ -133,6 +134,18 @@ class TestPackagedWeights:
     def test_a_package_without_the_file_is_told_too(self):
         with pytest.raises(ConfigError, match=r"package numpy with its weights.* no file .*x\.pt"):
             packaged_weights("numpy", "x.pt")
+
+
+class TestLoadWeights:
+    def test_weights_that_leave_a_part_of_the_network_random_are_refused(self):
+        network = torch.nn.Linear(2, 3)
+        with pytest.raises(ConfigError, match="all of kornia's Linear, found none for bias"):
+            load_weights(network, {"weight": torch.ones(3, 2)})
+
+    def test_derived_constants_may_be_absent(self):
+        network = torch.nn.BatchNorm1d(2)
+        load_weights(network, {"weight": torch.full((2,), 3.0), "bias": torch.zeros(2)})
+        assert network.weight.tolist() == [3.0, 3.0]
 
 
 def small_network(seed=0):

@@ -233,7 +233,7 @@ class TestLearnedMatchers:
     def test_point_matches_join_tracks(self, monkeypatch):
         from roel_service.mapping import learned
 
-        monkeypatch.setattr(learned, "NETWORK_WIDTH_PX", 320)
+        monkeypatch.setattr(learned, "LONG_SIDE_PX", 320)
         # Frames 0, 13, 26, each with its nearest; images are so small that 10 px are a third of a
         # line's length.
         points = MatchGlobalConfig(
