@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import BoolArray, FloatArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry.vectors import unit
 from roel_service.mapping.refine import DirectionPrior, Refined
@@ -30,8 +30,10 @@ BACKGROUND_DENSITY = 3.0
 MIN_LINE_COUNT = 6.0
 MIN_LINE_SHARE = 0.04
 MAX_DIRECTION_COUNT = 8
-# Candidates come from pairs of this many lines, the most certain ones.
-PAIRED_LINE_COUNT = 120
+# Candidates are the directions of this many lines, the most certain ones, and where the arcs of
+# this many cross.
+CANDIDATE_LINE_COUNT = 300
+PAIRED_LINE_COUNT = 60
 MEAN_SHIFT_COUNT = 10
 # A line with this share of its density explained belongs to the direction and votes no more.
 EXPLAINED_SHARE = 0.2
@@ -55,14 +57,19 @@ class _UncertainDirections:
     spread_rad: FloatArray
     axis: FloatArray
 
+    def take(self, index: Array) -> _UncertainDirections:
+        """The lines of these indices, or of this mask."""
+        return _UncertainDirections(**{name: value[index] for name, value in vars(self).items()})
+
     def squared_distance(self, directions: FloatArray) -> FloatArray:
         """(D, L) squared Mahalanobis distances of (D, 3) directions, infinite far from a line.
 
         The precision vanishes along the line: the direction's own part across it is all that
         counts, and neither sign matters.
         """
-        outer = (directions[:, :, None] * directions[:, None, :]).reshape(-1, 9)
-        squared = outer @ self.precision.reshape(-1, 9).T
+        first, second = np.triu_indices(3)
+        outer = directions[:, first] * directions[:, second] * np.where(first == second, 1.0, 2.0)
+        squared = outer @ self.precision[:, first, second].T
         cosine = directions @ self.direction.T
         return np.asarray(np.where(np.abs(cosine) > 0.5, squared, np.inf))
 
@@ -94,12 +101,13 @@ def common_directions(refined: Refined, config: RefineConfig) -> FloatArray:
         config: noise of an observation, and how far lines deviate from a common direction.
     """
     lines = _uncertain_directions(refined, config)
-    votes = (lines.spread_rad < MAX_SPREAD_RAD).astype(np.float64)
+    lines = lines.take(lines.spread_rad < MAX_SPREAD_RAD)
+    votes = np.ones(len(lines.direction))
     least = max(MIN_LINE_COUNT, MIN_LINE_SHARE * votes.sum())
-    candidates = _candidates(lines, votes > 0)
     found: list[FloatArray] = []
-    if len(candidates) == 0:
+    if not votes.any():
         return np.empty((0, 3))
+    candidates = _candidates(lines)
     share = lines.density(candidates)
     share /= share + BACKGROUND_DENSITY
     while len(found) < MAX_DIRECTION_COUNT:
@@ -136,17 +144,16 @@ def _shifted(lines: _UncertainDirections, direction: FloatArray, weight: FloatAr
     return np.asarray(unit(direction + np.linalg.solve(information + along, pull)))
 
 
-def _candidates(lines: _UncertainDirections, voting: BoolArray) -> FloatArray:
-    """(D, 3) the lines' own directions, and where the arcs of the most certain ones cross."""
-    chosen = np.flatnonzero(voting)
-    chosen = chosen[np.argsort(-lines.peak[chosen], kind="stable")]
-    axis = lines.axis[chosen[:PAIRED_LINE_COUNT]]
+def _candidates(lines: _UncertainDirections) -> FloatArray:
+    """(D, 3) directions of the most certain lines, and where the arcs of some of them cross."""
+    most_certain = np.argsort(-lines.peak, kind="stable")[:CANDIDATE_LINE_COUNT]
+    axis = lines.axis[most_certain[:PAIRED_LINE_COUNT]]
     first, second = np.triu_indices(len(axis), k=1)
     crossing = np.cross(axis[first], axis[second])
     length = np.linalg.norm(crossing, axis=1)
     # Arcs closer than a degree cross anywhere.
     clear = length > np.sin(np.deg2rad(1.0))
-    return np.concatenate([lines.direction[chosen], crossing[clear] / length[clear, None]])
+    return np.concatenate([lines.direction[most_certain], crossing[clear] / length[clear, None]])
 
 
 def _uncertain_directions(refined: Refined, config: RefineConfig) -> _UncertainDirections:
