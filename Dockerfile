@@ -10,6 +10,7 @@ WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
 COPY roel_service roel_service
 COPY clients clients
+COPY bench/roel_bench bench/roel_bench
 RUN python -m venv /opt/roel && /opt/roel/bin/pip install --no-cache-dir .
 
 FROM python:3.11-slim-bookworm

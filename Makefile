@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 WEIGHTS := .venv/.weights
 LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current no-large-files format proto bench limap serve
+.PHONY: demo learned test check stubs-are-current no-large-files format proto bench accuracy limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -32,8 +32,11 @@ format: $(INSTALLED)
 proto: $(INSTALLED)  ## write the committed stubs of proto/ anew
 	$(BIN)/python proto/generate.py
 
-bench: $(INSTALLED)  ## seconds and figures of each stage on simulated rooms
-	$(BIN)/python bench/rooms.py
+bench: $(INSTALLED)  ## measure the maps; SUITE=full takes hours, needs ROEL_DATA and `make limap`
+	$(BIN)/roel bench mapping --suite $(or $(SUITE),quick) --out $(or $(OUT),bench-out)
+
+accuracy: $(INSTALLED)  ## write docs/accuracy.md anew from bench/results/mapping.json
+	$(BIN)/python -m roel_bench.report
 
 limap: $(LIMAP_INSTALLED)  ## the benchmark's peer LIMAP, by itself: its OpenCV would overwrite ours
 

@@ -1,7 +1,7 @@
 """Readers of recordings that only the benchmark knows: AEDAT 2.0 and the DVS128 `.mat` files.
 
-Both hold columns and rows as a jAER chip counts them; events come out with pixel (0, 0) in the
-top-left corner.
+A DAVIS240 counts columns from the right and rows from below; its events come out with pixel (0, 0)
+in the top-left corner. The `.mat` files are taken as they are.
 """
 
 from __future__ import annotations

@@ -133,10 +133,16 @@ def digest_of(text: str) -> str:
 
 
 def write_results(path: Path, results: Results) -> None:
-    """Write all rows; the file is whole or as it was before."""
+    """Write all rows, one a line; the file is whole or as it was before."""
+    document = to_document(results)
+    rows = ",\n".join(_json(row) for row in document.pop("rows"))
+    head = _json(document).removesuffix("}")
     with whole_file(path) as temporary:
-        text = json.dumps(to_document(results), indent=1, allow_nan=False, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(f'{head}, "rows": [\n{rows}\n]}}\n', encoding="utf-8")
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, ensure_ascii=False)
 
 
 def to_document(results: Results) -> dict[str, Any]:

@@ -21,6 +21,11 @@ MAP_COLUMNS = (
     ("precision 20", "precision_20", 2),
     ("recall 20", "recall_20", 2),
 )
+# What recordings have that know no surfaces.
+RECORDING_COLUMNS = (
+    ("true lines covered", "covered_line_share", 2),
+    ("held-back events explained", "held_back_explained_share", 2),
+)
 FRAME_COLUMNS = (
     ("lines a frame", "lines_per_frame", 0),
     ("precision", "precision", 3),
@@ -67,7 +72,7 @@ def all_rows(results: Results) -> str:
     """Every row of a run, maps first."""
     blocks = []
     for task, title, columns in (
-        (MAP, "Maps", MAP_COLUMNS),
+        (MAP, "Maps", (*MAP_COLUMNS, *RECORDING_COLUMNS)),
         (FRONT_END, "Lines of single frames", FRAME_COLUMNS),
     ):
         rows = results.select(lambda row, task=task: row.task == task)  # type: ignore[misc]

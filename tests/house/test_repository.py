@@ -39,7 +39,9 @@ def test_every_hook_runs_on_this_machine_alone() -> None:
     assert set(re.findall(r"language: (\S+)", text)) == {"system"}
 
 
-@pytest.mark.parametrize("target", ["demo", "test", "check", "format", "proto", "bench", "serve"])
+@pytest.mark.parametrize(
+    "target", ["demo", "test", "check", "format", "proto", "bench", "accuracy", "serve"]
+)
 def test_make_knows_the_target(target: str) -> None:
     assert run("make", "--dry-run", target).returncode == 0
 
