@@ -408,8 +408,9 @@ def _recordings(report: _Report) -> str:
         "`slider_depth` is real, with the poses of a slider: a tenth of the events is held back,"
         " and asked whether a line lies within 5 px. `events_room01` is simulated from photographs"
         " of a real house: a true line of its layout counts if more than 0.5 m of it was in the"
-        " picture in at least 10 frames, and is covered if map lines lie within 3 cm of 70 % of"
-        " that. The others are real and have no poses: lines of single frames alone."
+        " picture in at least 10 frames (*active*: with events beside it), and is covered if map"
+        " lines lie within 3 cm of 70 % of that. The others are real and have no poses: lines of"
+        " single frames alone."
     )
     return _section(
         "Recordings",
@@ -425,7 +426,8 @@ POSED_FIGURES = (
     "held_back_median_px",
     "true_line_count",
     "covered_line_share",
-    "covered_length_share",
+    "active_line_count",
+    "covered_active_line_share",
 )
 
 

@@ -46,7 +46,10 @@ def score(scene: Scene, entities: LineMap | FloatArray) -> Figures:
         raise InputError(scene.name, "lines of a scene with poses", "points")
     if isinstance(scene.truth, LineTruth):
         frames = _frames(scene, scene.trajectory)
-        return common | coverage_figures(scene.truth.segments, entities, frames)
+        ideal_px = undistortion_table(scene.camera)
+        return common | coverage_figures(
+            scene.truth.segments, entities, frames, scene.events, ideal_px
+        )
     return common | held_back_figures(scene, scene.truth, scene.trajectory, entities)
 
 

@@ -72,7 +72,7 @@ def test_parts_that_pay_are_counted():
 
 def test_milliseconds_and_covered_lines():
     assert found("`default`, 640x480: ms a frame") == pytest.approx(100.0)
-    assert found("`events_room01`: share of the true lines that are covered") == 0.9
+    assert found("`events_room01`: share of the true lines in the picture that are covered") == 0.9
 
 
 def line_of(text, beginning):
