@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import asdict
 
 import numpy as np
@@ -11,13 +12,15 @@ from roel_bench.results import Figures
 from roel_bench.scenes import HeldBackEvents, LineTruth, MapTruth, Scene
 from roel_service.arrays import FloatArray
 from roel_service.config.presets import preset
-from roel_service.errors import InputError
+from roel_service.errors import InputError, MapFileError
 from roel_service.evaluation.maps import distances_to_mesh, evaluate_points, sample_lines
 from roel_service.geometry.projection import project, undistortion_table
 from roel_service.geometry.segments import point_segment_distance
 from roel_service.mapping.frames import Frames, frame_times, frames_at
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
 
 # A held-back event farther than this from every line is of something else: text, curves, noise.
 EXPLAINED_PX = 5.0
@@ -56,7 +59,11 @@ def score(scene: Scene, entities: LineMap | FloatArray) -> Figures:
 def _against_surfaces(truth: MapTruth, entities: LineMap | FloatArray) -> Figures:
     if len(entities) == 0:
         return dict(NOTHING) if truth.edges is not None else {}
-    samples = sample_lines(entities) if isinstance(entities, LineMap) else entities
+    try:
+        samples = sample_lines(entities) if isinstance(entities, LineMap) else entities
+    except MapFileError as error:  # a variant without filters may reach for the stars
+        logger.warning("no figures: %s", error)
+        return dict(NOTHING)
     if truth.edges is not None:
         figures = asdict(evaluate_points(samples, truth.mesh, truth.edges))
         del figures["line_count"]  # the entities are counted already

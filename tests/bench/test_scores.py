@@ -42,6 +42,13 @@ def test_empty_maps_find_no_edges():
     assert score(scene(truth=KNOWN), np.empty((0, 3)))["iou_20"] == 0.0
 
 
+def test_lines_too_long_to_be_sampled_find_no_edges(caplog):
+    endless = LineMap.from_segments(np.array([[[0.0, 0, 0], [1e6, 0, 0]]]))
+    figures = score(scene(truth=KNOWN), endless)
+    assert (figures["entity_count"], figures["iou_20"]) == (1, 0.0)
+    assert "100000 m" in caplog.text
+
+
 def test_surfaces_alone_give_accuracy_and_precision():
     mesh = TriangleMesh(triangles=square(4.0, 2.0))
     # 7 mm before the surface.
