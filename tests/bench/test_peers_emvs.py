@@ -34,7 +34,9 @@ SETTINGS = EmvsSettings(
     max_depth_m=4.0,
     plane_count=80,
     # Votes without noise stand out, and lower maxima are chance meetings of rays.
+    threshold_window_px=5,
     threshold_offset=25.0,
+    median_window_px=5,
     # One span, as long as the slide.
     keyframes=KeyframeSettings(distance_share=1.0, min_baseline_share=0.0),
 )

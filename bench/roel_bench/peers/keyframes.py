@@ -32,7 +32,7 @@ class KeyframeSettings:
             its distance gives no map, since its depths are not observable.
     """
 
-    distance_share: float = 0.15
+    distance_share: float = 0.1
     turn_share: float = 0.5
     min_baseline_share: float = 0.3
 
