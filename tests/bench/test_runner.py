@@ -7,7 +7,7 @@ from roel_bench.methods import find_method
 from roel_bench.results import FILE_NAME, Results, read_results, write_results
 from roel_bench.runner import Runner
 from roel_bench.suites import FRONT_END, MAP, Cell
-from roel_service.errors import InputError
+from roel_service.errors import InputError, NoAnswerError
 from roel_service.progress import Progress
 from tests.bench.samples import row
 
@@ -101,3 +101,12 @@ def test_unknown_names_are_told_before_anything_runs(places, tmp_path, wrong):
         Runner(places=places, folder=tmp_path / "new", progress=told.append).run(cells)
     assert told == []
     assert not (tmp_path / "new").exists()
+
+
+def test_windows_longer_than_the_warm_up_are_no_obstacle(places, tmp_path):
+    cell = Cell(task=FRONT_END, scene=WARM_UP_ROOM, method="paper: windows x 10, no planes")
+    with pytest.raises(NoAnswerError, match="at least one frame"):
+        Runner(places=places, folder=tmp_path).run([cell])
+    longer = replace(cell, scene="sim_1_32x24_0.7s")
+    results = Runner(places=places, folder=tmp_path).run([longer])
+    assert results.rows[0].frame_count >= 1
