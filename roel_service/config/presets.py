@@ -20,7 +20,7 @@ UNLIMITED = 1e6
 
 # Published values and choices; what the paper leaves open is marked in docs/paper_map.md.
 PAPER = Config(
-    frames=FramesConfig(compensate_rotation=False),
+    frames=FramesConfig(rate_hz=100.0, compensate_rotation=False),
     detect=DetectConfig(
         representations=("binary", "timestamp"),
         merge_distance_px=2.0,
@@ -48,6 +48,7 @@ PAPER = Config(
         max_length_weight_px=UNLIMITED,
         direction_sigma_deg=0.0,
         max_residual_px=20.0,
+        min_inlier_count=10,
     ),
     trim=TrimConfig(
         method="cluster",

@@ -1,3 +1,4 @@
+import dataclasses
 import types
 
 import cv2
@@ -192,6 +193,13 @@ class TestDetectLines:
         assert len(seeds) == 4
         np.testing.assert_array_equal(seeds.polarity, [1, -1, 1, -1])
         assert (np.diff(segments.length(seeds.segments_px)) <= 0).all()
+
+    def test_lines_of_all_images_may_be_merged_whatever_their_polarity(self):
+        detector = ListedLines(((10, 10), (50, 10)), ((20, 30), (20, 90)))
+        config = dataclasses.replace(CONFIG, merge_across_polarities=True)
+        seeds = detect_lines([self.image(1), self.image(-1), self.image()], detector, config)
+        assert len(seeds) == 2
+        np.testing.assert_array_equal(seeds.polarity, [0, 0])
 
     @pytest.mark.parametrize(
         ("config", "kept"),
