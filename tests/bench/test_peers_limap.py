@@ -17,7 +17,7 @@ from roel_bench.peers.limap_lines import (
     detected_lines,
     hamming_distances,
 )
-from roel_service.errors import NoAnswerError, NotFoundError
+from roel_service.errors import ConfigError, NoAnswerError, NotFoundError
 from roel_service.geometry import se3
 from roel_service.geometry.projection import project
 from roel_service.geometry.se3 import SE3
@@ -271,6 +271,11 @@ def test_missing_environment_says_how_to_make_it(tmp_path):
     )
     with pytest.raises(NotFoundError, match="make limap"):
         limap.map_segments(events, trajectory, CAMERA, LimapSettings(), environment=tmp_path)
+
+
+def test_unknown_source_of_lines_is_refused():
+    with pytest.raises(ConfigError, match="lsd, own"):
+        LimapSettings(lines="sold2")
 
 
 needs_limap = pytest.mark.skipif(

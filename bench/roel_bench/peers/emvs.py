@@ -17,6 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 import cv2
 import numpy as np
@@ -179,36 +180,48 @@ def key_views(
     progress: ProgressCallback = ignore,
 ) -> Iterator[KeyView]:
     """Depth maps of all key views, in the order of time; arguments and errors as `map_points`."""
+    next_span = partial(
+        span_from, trajectory=trajectory, camera=camera, settings=settings.keyframes
+    )
     volume = Volume(camera, trajectory, settings)
-    end_us = int(trajectory.t_us[-1])
     mean_depth_m = float(np.sqrt(settings.min_depth_m * settings.max_depth_m))
     span: Span | None = None
-    view_count = event_count = 0
+    has_begun = False
     for chunk in events.chunks():
         if len(chunk) == 0:
             continue
-        if event_count == 0:
-            span = span_from(
-                int(chunk.t_us[0]), mean_depth_m, trajectory, camera, settings.keyframes
-            )
-        event_count += len(chunk)
+        if not has_begun:
+            span = next_span(int(chunk.t_us[0]), mean_depth_m)
+            has_begun = True
         while span is not None:
             volume.add(chunk, span)
             if span.stop_us > chunk.t_us[-1]:
                 break
             view = volume.take(span)
             if view is not None:
-                view_count += 1
                 mean_depth_m = float(view.depth_m[view.mask].mean())
                 yield view
-            done = min(1.0, (span.stop_us - trajectory.t_us[0]) / (end_us - trajectory.t_us[0]))
-            progress(Progress(stage="emvs", done_count=view_count, total_count=0, fraction=done))
-            span = span_from(span.stop_us, mean_depth_m, trajectory, camera, settings.keyframes)
-    if event_count == 0:
+            _tell(progress, span.stop_us, trajectory)
+            span = next_span(span.stop_us, mean_depth_m)
+    if not has_begun:
         raise EventsError("events", "at least one event", "none", reason="NO_EVENTS")
     view = volume.take(span) if span is not None else None
     if view is not None:
         yield view
+
+
+def _tell(progress: ProgressCallback, t_us: int, trajectory: Trajectory) -> None:
+    """Progress by the time of the poses; the number of key views is not known before the last."""
+    first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
+    done_us = min(t_us, last_us) - first_us
+    progress(
+        Progress(
+            stage="emvs",
+            done_count=done_us,
+            total_count=last_us - first_us,
+            fraction=done_us / (last_us - first_us),
+        )
+    )
 
 
 class Volume:

@@ -26,7 +26,7 @@ import numpy as np
 from roel_bench.peers.limap_lines import FrameLines, best_matches, detected_lines
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import Config, DetectConfig, FramesConfig
-from roel_service.errors import EventsError, NoAnswerError, NotFoundError
+from roel_service.errors import ConfigError, EventsError, NoAnswerError, NotFoundError
 from roel_service.geometry.projection import undistortion_table
 from roel_service.geometry.vectors import norm
 from roel_service.mapping.detect import detect_lines, line_detector
@@ -49,7 +49,8 @@ from roel_service.scene.trajectory import Trajectory
 # The environment that `make limap` makes, and the script that runs in it.
 ENVIRONMENT = Path(__file__).parents[3] / ".venv-limap"
 WORKER = Path(__file__).with_name("limap_worker.py")
-# Lines of a report that are worth repeating when the worker fails.
+LINES = ("lsd", "own")
+# Characters of the worker's last words that an error repeats.
 MAX_ERROR_LENGTH = 300
 
 
@@ -111,6 +112,10 @@ class LimapSettings:
     neighbor_count: int = 60
     defaults: LimapDefaults = LIMAP_2
     timeout_s: float = 3600.0
+
+    def __post_init__(self) -> None:
+        if self.lines not in LINES:
+            raise ConfigError("limap.lines", "one of " + ", ".join(LINES), self.lines)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
