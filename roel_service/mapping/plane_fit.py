@@ -56,12 +56,12 @@ def fit_space_time_planes(
     """
     if config.method == "none":
         return _as_detected(seeds)
-    grid = _grid(frame)
     tau_ms = (frame.events.t_us - frame.events.t_ref_us).astype(np.float64) * 1e-3
+    grid = _grid(frame, tau_ms)
     if config.method == "vote":
-        lines, speeds, polarity = _fit_by_vote(seeds, frame, grid, tau_ms, config)
+        lines, speeds, polarity = _fit_by_vote(seeds, frame, grid, config)
     elif config.method == "ransac":
-        lines, speeds, polarity = _fit_by_ransac(seeds, frame, grid, tau_ms, config, rng)
+        lines, speeds, polarity = _fit_by_ransac(seeds, grid, config, rng)
     else:
         lines, speeds, polarity = _fit_directly(frame, tau_ms, config, rng)
     offsets, chosen = plane_fit_kernels.support(
@@ -69,8 +69,6 @@ def fit_space_time_planes(
         speeds,
         polarity,
         grid,
-        frame.compensated_px,
-        tau_ms,
         config.inlier_distance_px,
         config.support_half_window_us * 1e-3,
         config.support_event_count,
@@ -97,17 +95,25 @@ def _as_detected(seeds: Seeds) -> FittedLines:
     )
 
 
-def _grid(frame: EventFrame) -> Grid:
+def _grid(frame: EventFrame, tau_ms: FloatArray) -> Grid:
     rows = int(np.ceil(frame.height / CELL_PX))
     columns = int(np.ceil(frame.width / CELL_PX))
     start, order = plane_fit_kernels.grid_events(
         frame.compensated_px, frame.events.polarity, rows, columns, CELL_PX
     )
-    return Grid(start=start, order=order, rows=rows, columns=columns, cell_px=CELL_PX)
+    return Grid(
+        start=start,
+        order=order,
+        xy_px=frame.compensated_px[order],
+        tau_ms=tau_ms[order],
+        rows=rows,
+        columns=columns,
+        cell_px=CELL_PX,
+    )
 
 
 def _fit_by_vote(
-    seeds: Seeds, frame: EventFrame, grid: Grid, tau_ms: FloatArray, config: PlaneFitConfig
+    seeds: Seeds, frame: EventFrame, grid: Grid, config: PlaneFitConfig
 ) -> tuple[FloatArray, FloatArray, Array]:
     """Speed vote and robust least squares, a polarity at a time; better fits drop duplicates."""
     settings = VoteSettings(
@@ -122,7 +128,7 @@ def _fit_by_vote(
         min_density_ratio=config.min_density_ratio,
     )
     lines, speeds, scores, polarity = plane_fit_kernels.fit_by_vote(
-        seeds.segments_px, seeds.polarity, grid, frame.compensated_px, tau_ms, settings
+        seeds.segments_px, seeds.polarity, grid, settings
     )
     best = _best_first(lines, scores, polarity, config)
     return lines[best], speeds[best], polarity[best]
@@ -130,9 +136,7 @@ def _fit_by_vote(
 
 def _fit_by_ransac(
     seeds: Seeds,
-    frame: EventFrame,
     grid: Grid,
-    tau_ms: FloatArray,
     config: PlaneFitConfig,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, Array]:
@@ -140,8 +144,6 @@ def _fit_by_ransac(
     lines, speeds, scores = plane_fit_kernels.fit_by_ransac(
         seeds.segments_px,
         grid,
-        frame.compensated_px,
-        tau_ms,
         rng.random((len(seeds), config.trial_count, 3)),
         config.candidate_distance_px,
         config.time_scale_px_per_ms,

@@ -44,17 +44,23 @@ MIN_IMAGE_PART = 1e-3
 
 
 class Grid(NamedTuple):
-    """Events of one frame by cells, a polarity each: those of cell c are order[start[c]:start[c+1]].
+    """Events of one frame, sorted by cells, a polarity each: cell c has start[c] to start[c+1].
+
+    The events of a cell lie side by side in memory, because every line looks through many.
 
     Attributes:
         start: (2 * rows * columns + 1,) int64; the positive cells follow the negative ones.
-        order: (K,) int64 event indices.
+        order: (K,) int64 index of each sorted event in the frame.
+        xy_px: (K, 2) float32, sorted.
+        tau_ms: (K,) float64 against the frame's time, sorted.
         rows, columns: cells.
         cell_px: side of a cell.
     """
 
     start: Array
     order: Array
+    xy_px: Array
+    tau_ms: Array
     rows: int
     columns: int
     cell_px: float
@@ -124,16 +130,16 @@ def local_frame(segment: Array) -> Local:
 
 @numba.njit(cache=True, nogil=True)
 def gather(
-    local: Local, max_s: float, max_u: float, side: int, grid: Grid, xy_px: Array, near: Array
+    local: Local, max_s: float, max_u: float, side: int, grid: Grid, near: Array
 ) -> tuple[Array, int]:
-    """Indices of the events of one polarity with |s| < max_s and |u| < max_u.
+    """The events of one polarity with |s| < max_s and |u| < max_u, by their place in the grid.
 
     Args:
         side: 0 for negative, 1 for positive.
         near: (n,) int64 buffer, grown where it is too small.
 
     Returns:
-        The buffer and the number of indices in it.
+        The buffer and the number of places in it.
     """
     reach_x = abs(local.dx) * max_u + abs(local.dy) * max_s
     reach_y = abs(local.dy) * max_u + abs(local.dx) * max_s
@@ -151,9 +157,8 @@ def gather(
             if abs(mx * local.dy - my * local.dx) > margin:
                 continue
             cell = (side * grid.rows + row) * grid.columns + column
-            for place in range(grid.start[cell], grid.start[cell + 1]):
-                k = grid.order[place]
-                ex, ey = xy_px[k, 0] - local.qx, xy_px[k, 1] - local.qy
+            for k in range(grid.start[cell], grid.start[cell + 1]):
+                ex, ey = grid.xy_px[k, 0] - local.qx, grid.xy_px[k, 1] - local.qy
                 u = ex * local.dx + ey * local.dy
                 s = ey * local.dx - ex * local.dy
                 if abs(s) < max_s and abs(u) < max_u:
@@ -165,17 +170,15 @@ def gather(
 
 
 @numba.njit(cache=True, nogil=True)
-def local_coordinates(
-    local: Local, near: Array, xy_px: Array, tau_ms: Array
-) -> tuple[Array, Array, Array]:
+def local_coordinates(local: Local, near: Array, grid: Grid) -> tuple[Array, Array, Array]:
     """u, s and tau of the events `near`, (n,) float64 each."""
     u, s, tau = np.empty(len(near)), np.empty(len(near)), np.empty(len(near))
     for i in range(len(near)):
         k = near[i]
-        ex, ey = xy_px[k, 0] - local.qx, xy_px[k, 1] - local.qy
+        ex, ey = grid.xy_px[k, 0] - local.qx, grid.xy_px[k, 1] - local.qy
         u[i] = ex * local.dx + ey * local.dy
         s[i] = ey * local.dx - ex * local.dy
-        tau[i] = tau_ms[k]
+        tau[i] = grid.tau_ms[k]
     return u, s, tau
 
 
@@ -183,28 +186,63 @@ def local_coordinates(
 def vote_speed(
     half: float, u: Array, s: Array, tau: Array, settings: VoteSettings
 ) -> tuple[float, float]:
-    """(alpha, gamma) for which most events fall into two neighbouring bins of s - gamma tau."""
-    bin_count = int(2.0 * settings.candidate_distance_px / VOTE_BIN_PX)
-    stride = max(1, len(u) // VOTE_EVENT_COUNT)
-    best, best_alpha, best_gamma = -1.0, 0.0, 0.0
-    counts = np.zeros(bin_count, np.int64)
+    """(alpha, gamma) for which most events fall into two neighbouring bins of s - gamma tau.
+
+    Every other speed is tried first, then the two beside the best one.
+    """
+    stride = 1 + len(u) // VOTE_EVENT_COUNT
+    # In bins, from the lower end of the range on.
+    position, rate = np.empty(len(u) // stride + 1), np.empty(len(u) // stride + 1)
+    chosen = 0
+    for k in range(0, len(u), stride):
+        if abs(u[k]) <= half + 2.0:
+            position[chosen] = (s[k] + settings.candidate_distance_px) / VOTE_BIN_PX
+            rate[chosen] = tau[k] / VOTE_BIN_PX
+            chosen += 1
+    position, rate = position[:chosen], rate[:chosen]
+    counts = np.empty(int(2.0 * settings.candidate_distance_px / VOTE_BIN_PX), np.int64)
     step = 2.0 * settings.max_speed_px_per_ms / (settings.speed_count - 1)
-    for index in range(settings.speed_count):
+    best, best_alpha, best_index = -1.0, 0.0, 0
+    for index in range(0, settings.speed_count, 2):
         gamma = index * step - settings.max_speed_px_per_ms
-        counts[:] = 0
-        for k in range(0, len(u), stride):
-            if abs(u[k]) > half + 2.0:
-                continue
-            place = np.floor((s[k] - gamma * tau[k] + settings.candidate_distance_px) / VOTE_BIN_PX)
-            if 0 <= place < bin_count:
-                counts[int(place)] += 1
-        for place in range(bin_count - 1):
-            alpha = (place + 1) * VOTE_BIN_PX - settings.candidate_distance_px
-            pair = counts[place] + counts[place + 1]
-            score = pair * (1.0 - VOTE_OFFSET_COST_PER_PX * abs(alpha))
+        score, alpha = strongest_bins(position, rate, gamma, settings, counts)
+        if score > best:
+            best, best_alpha, best_index = score, alpha, index
+    coarse = best_index
+    for index in (coarse - 1, coarse + 1):
+        if 0 <= index < settings.speed_count:
+            gamma = index * step - settings.max_speed_px_per_ms
+            score, alpha = strongest_bins(position, rate, gamma, settings, counts)
             if score > best:
-                best, best_alpha, best_gamma = score, alpha, gamma
-    return best_alpha, best_gamma
+                best, best_alpha, best_index = score, alpha, index
+    return best_alpha, best_index * step - settings.max_speed_px_per_ms
+
+
+@numba.njit(cache=True, nogil=True)
+def strongest_bins(
+    position: Array, rate: Array, gamma: float, settings: VoteSettings, counts: Array
+) -> tuple[float, float]:
+    """Score and offset (px) of the two neighbouring bins that most events fall into.
+
+    Args:
+        position, rate: (n,) bins at tau = 0, and bins for each px/ms of speed.
+        gamma: speed, px/ms.
+        counts: buffer with one number a bin.
+    """
+    counts[:] = 0
+    for k in range(len(position)):
+        place = position[k] - gamma * rate[k]
+        # Truncation is towards zero: without the first test, (-1, 0) would count as bin 0.
+        if place >= 0.0 and place < len(counts):
+            counts[int(place)] += 1
+    best, best_alpha = -1.0, 0.0
+    for place in range(len(counts) - 1):
+        alpha = (place + 1) * VOTE_BIN_PX - settings.candidate_distance_px
+        pair = counts[place] + counts[place + 1]
+        score = pair * (1.0 - VOTE_OFFSET_COST_PER_PX * abs(alpha))
+        if score > best:
+            best, best_alpha = score, alpha
+    return best, best_alpha
 
 
 @numba.njit(cache=True, nogil=True)
@@ -252,6 +290,8 @@ def fit_robust(
         right[2] += prior * voted
         if not solve_3x3(normal, right, plane):
             return 0
+        if width == last_px:
+            break
         width = max(width * RESIDUAL_SHRINK, last_px)
     return inliers
 
@@ -335,8 +375,6 @@ def fit_seed(
     segment: Array,
     side: int,
     grid: Grid,
-    xy_px: Array,
-    tau_ms: Array,
     settings: VoteSettings,
     near: Array,
     line: Array,
@@ -353,8 +391,8 @@ def fit_seed(
     local = local_frame(segment)
     seed_half = local.half
     reach = seed_half + settings.extension_px
-    near, count = gather(local, settings.candidate_distance_px, reach, side, grid, xy_px, near)
-    u, s, tau = local_coordinates(local, near[:count], xy_px, tau_ms)
+    near, count = gather(local, settings.candidate_distance_px, reach, side, grid, near)
+    u, s, tau = local_coordinates(local, near[:count], grid)
     if count < 0.6 * seed_half:
         return near, 0.0, 0.0
     plane = np.zeros(3)
@@ -374,8 +412,8 @@ def fit_seed(
             qx, qy = local.qx - plane[0] * local.dy, local.qy + plane[0] * local.dx
             local = Local(qx, qy, dx, dy, seed_half)
             wide = SECOND_GATHER * settings.candidate_distance_px
-            near, count = gather(local, wide, reach, side, grid, xy_px, near)
-            u, s, tau = local_coordinates(local, near[:count], xy_px, tau_ms)
+            near, count = gather(local, wide, reach, side, grid, near)
+            u, s, tau = local_coordinates(local, near[:count], grid)
             plane[0], plane[1], plane[2] = 0.0, 0.0, plane[2] / turn
     residual = s - plane[0] - plane[1] * u - plane[2] * tau
     start, stop, occupancy = walk_support(seed_half, u, residual, settings)
@@ -405,8 +443,6 @@ def fit_by_vote(
     segments: Array,
     polarity: Array,
     grid: Grid,
-    xy_px: Array,
-    tau_ms: Array,
     settings: VoteSettings,
 ) -> tuple[Array, Array, Array, Array]:
     """Fit every seed, those of unknown polarity once for each.
@@ -432,7 +468,7 @@ def fit_by_vote(
             row = 2 * i + side
             labels[row] = label
             near, speeds[row], scores[row] = fit_seed(
-                segments[i], side, grid, xy_px, tau_ms, settings, near, lines[row]
+                segments[i], side, grid, settings, near, lines[row]
             )
     return lines, speeds, scores, labels
 
@@ -443,8 +479,6 @@ def support(
     speeds: Array,
     polarity: Array,
     grid: Grid,
-    xy_px: Array,
-    tau_ms: Array,
     max_distance_px: float,
     max_tau_ms: float,
     max_count: int,
@@ -473,16 +507,16 @@ def support(
         for side in range(2):
             if polarity[m] == 1 - 2 * side:
                 continue
-            near, count = gather(local, reach, local.half, side, grid, xy_px, near)
-            _, s, tau = local_coordinates(local, near[:count], xy_px, tau_ms)
+            near, count = gather(local, reach, local.half, side, grid, near)
+            _, s, tau = local_coordinates(local, near[:count], grid)
             fits = (np.abs(s - speeds[m] * tau) < max_distance_px) & (np.abs(tau) < max_tau_ms)
             found = np.concatenate((found, near[:count][fits]))
         # Equal times are told apart by the event's index: the order of the grid must not matter.
-        found = np.sort(found)
-        found = found[np.argsort(np.abs(tau_ms[found]), kind="mergesort")][:max_count]
+        found = found[np.argsort(grid.order[found])]
+        found = found[np.argsort(np.abs(grid.tau_ms[found]), kind="mergesort")][:max_count]
         while total + len(found) > len(chosen):
             chosen = np.concatenate((chosen, np.empty_like(chosen)))
-        chosen[total : total + len(found)] = found
+        chosen[total : total + len(found)] = grid.order[found]
         total += len(found)
         offsets[m + 1] = total
     return offsets, chosen[:total]
@@ -492,8 +526,6 @@ def support(
 def fit_by_ransac(
     segments: Array,
     grid: Grid,
-    xy_px: Array,
-    tau_ms: Array,
     draws: Array,
     candidate_distance_px: float,
     scale_px_per_ms: float,
@@ -520,8 +552,8 @@ def fit_by_ransac(
         reach = local.half + candidate_distance_px
         points = np.empty((0, 3))
         for side in range(2):
-            near, count = gather(local, candidate_distance_px, reach, side, grid, xy_px, near)
-            u, s, tau = local_coordinates(local, near[:count], xy_px, tau_ms)
+            near, count = gather(local, candidate_distance_px, reach, side, grid, near)
+            u, s, tau = local_coordinates(local, near[:count], grid)
             part = np.column_stack((u, s, scale_px_per_ms * tau))
             close = segment_distance(u, s, local.half) < candidate_distance_px
             points = np.concatenate((points, part[close]))
