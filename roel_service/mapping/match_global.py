@@ -36,6 +36,8 @@ MIN_PROJECTION_PX = 5.0
 # How much many observations count against a small residual when lines compete for one: px for a
 # factor of e.
 COMPETITION_PX = 0.3
+# Decimals of that cost, px, that tell lines apart.
+COST_DECIMALS = 6
 # Half of the time step over which the camera's velocity is measured.
 VELOCITY_HALF_STEP_US = 5_000
 
@@ -218,7 +220,8 @@ def _exclusive(refined: Refined, views: Views, frames: Frames) -> LineTracks:
         )
     ).max(axis=-1)
     cost = residual_px - COMPETITION_PX * np.log(tracks.sizes[line])
-    order = np.lexsort([line, cost, tracks.observation])
+    # Lines that fit equally well but for rounding must not share: the first one takes all.
+    order = np.lexsort([line, np.round(cost, COST_DECIMALS), tracks.observation])
     first = np.ones(len(order), dtype=bool)
     first[1:] = np.diff(tracks.observation[order]) != 0
     winners = np.sort(order[first])

@@ -150,9 +150,9 @@ class TestGradient:
         )
         gradient = 2.0 * problem.system(state, weight).gradient
         size = np.abs(gradient).max(axis=1, keepdims=True)
-        # Central differences at 1e-5: truncation 1e-10 of the third derivative, rounding 1e-11 of
-        # the cost; both relative to the largest component.
-        assert (np.abs(numeric - gradient) < 1e-5 * size).all()
+        # Central differences at 1e-5: truncation 1e-10 of the third derivative, which the quartic
+        # cost of short lines has large, rounding 1e-11 of the cost; relative to the largest part.
+        assert (np.abs(numeric - gradient) < 1e-4 * size).all()
 
     @RESIDUALS
     def test_the_hessian_is_the_derivative_of_the_gradient_at_the_truth(self, config):
