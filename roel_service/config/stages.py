@@ -324,7 +324,7 @@ class RefineConfig(Stage, table="refine"):
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
     direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
-    direction_noise_px: float = parameter(0.5, POSITIVE)
+    direction_noise_px: float = parameter(0.3, POSITIVE)
     max_direction_distance: float = parameter(3.0, POSITIVE)
     iteration_count: int = parameter(8, UP_TO_1000)
     max_residual_px: float = parameter(2.0, POSITIVE)

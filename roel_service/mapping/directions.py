@@ -29,6 +29,9 @@ BACKGROUND_DENSITY = 3.0
 # A common direction has at least so many lines, in number and as a share of all.
 MIN_LINE_COUNT = 6.0
 MIN_LINE_SHARE = 0.04
+# ... and more than arcs that cross by chance would give, in standard deviations of their number:
+# the best of some thousand candidates is not to pass.
+CHANCE_DEVIATIONS = 6.0
 MAX_DIRECTION_COUNT = 8
 # Candidates are the directions of this many lines, the most certain ones, and where the arcs of
 # this many cross.
@@ -61,6 +64,13 @@ class _UncertainDirections:
         """The lines of these indices, or of this mask."""
         return _UncertainDirections(**{name: value[index] for name, value in vars(self).items()})
 
+    @property
+    def reach(self) -> FloatArray:
+        """(L,) share of all directions that each line votes for."""
+        # An ellipse in which the density is above the background's, of a half sphere.
+        ratio = np.maximum(self.peak / BACKGROUND_DENSITY, 1.0)
+        return np.asarray(np.log(ratio) / (2.0 * np.pi * self.peak))
+
     def squared_distance(self, directions: FloatArray) -> FloatArray:
         """(D, L) squared Mahalanobis distances of (D, 3) directions, infinite far from a line.
 
@@ -84,7 +94,7 @@ def direction_prior(refined: Refined, config: RefineConfig) -> DirectionPrior | 
         return None
     lines = _uncertain_directions(refined, config)
     common = common_directions(refined, config)
-    weight = (1.0 / np.deg2rad(config.direction_sigma_deg)) ** 2
+    weight = (config.direction_noise_px / np.deg2rad(config.direction_sigma_deg)) ** 2
     if len(common) == 0:
         return DirectionPrior(direction=lines.direction, weight=np.zeros(len(refined)))
     squared = lines.squared_distance(common)
@@ -103,7 +113,12 @@ def common_directions(refined: Refined, config: RefineConfig) -> FloatArray:
     lines = _uncertain_directions(refined, config)
     lines = lines.take(lines.spread_rad < MAX_SPREAD_RAD)
     votes = np.ones(len(lines.direction))
-    least = max(MIN_LINE_COUNT, MIN_LINE_SHARE * votes.sum())
+    by_chance = lines.reach.sum()
+    least = max(
+        MIN_LINE_COUNT,
+        MIN_LINE_SHARE * len(votes),
+        by_chance + CHANCE_DEVIATIONS * np.sqrt(by_chance),
+    )
     found: list[FloatArray] = []
     if not votes.any():
         return np.empty((0, 3))
