@@ -60,7 +60,12 @@ PAPER = Config(
     ),
 )
 
-PRESETS = {"default": Config(), "paper": PAPER}
+# Lines that the map can vouch for: what is left out is mostly right, but not surely.
+PRECISE = Config(
+    trim=TrimConfig(max_sigma_m=0.025, max_rms_px=0.45, min_support_ratio=0.5, min_frame_count=12)
+)
+
+PRESETS = {"default": Config(), "precise": PRECISE, "paper": PAPER}
 
 
 def preset(name: str) -> Config:
