@@ -39,22 +39,39 @@ def measure_evidence(
     frames_config: FramesConfig,
     refine_config: RefineConfig,
 ) -> Evidence:
-    """Viewing planes and quadratic forms of all observations.
+    """Viewing planes and quadratic forms of observations that carry their events."""
+    forms = supporting_forms(observations, frames, trajectory, frames_config, refine_config)
+    return evidence_of(observations, frames, forms, np.diff(observations.event_offsets))
+
+
+def supporting_forms(
+    observations: LineObservations,
+    frames: Frames,
+    trajectory: Trajectory,
+    frames_config: FramesConfig,
+    refine_config: RefineConfig,
+) -> FloatArray:
+    """(M, 6, 6) forms of the supporting events; after it the events themselves are not needed.
 
     Where rotation is compensated each event counts with the pose at its own time, else with that
     of its frame, as in the paper.
     """
-    own_poses = trajectory if frames_config.compensate_rotation else None
-    forms = event_forms(
+    return event_forms(
         observations,
         frames,
-        own_poses,
+        trajectory if frames_config.compensate_rotation else None,
         frames_config.slot_us,
         refine_config.event_count_per_line,
     )
+
+
+def evidence_of(
+    observations: LineObservations, frames: Frames, forms: FloatArray, event_counts: Array
+) -> Evidence:
+    """The evidence of observations whose events were summed up before."""
     return Evidence(
         views=views_of(observations, frames),
         event_forms=forms,
         segment_forms=segment_forms(observations, frames),
-        event_counts=np.diff(observations.event_offsets),
+        event_counts=event_counts,
     )

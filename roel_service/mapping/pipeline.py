@@ -2,49 +2,35 @@
 
 from __future__ import annotations
 
-import os
-import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from roel_service.arrays import Array
 from roel_service.config.stages import Config, RefineConfig
-from roel_service.geometry.projection import undistortion_table
-from roel_service.in_order import in_order
-from roel_service.mapping.detect import LineDetector, detect_lines, line_detector
+from roel_service.mapping.detect import LineDetector, line_detector
 from roel_service.mapping.directions import direction_prior
-from roel_service.mapping.evidence import Evidence, measure_evidence
+from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import (
     Frames,
-    event_frame,
-    frame_slices,
-    frame_times,
-    frames_at,
 )
+from roel_service.mapping.front_end import lines_of_all_frames
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
-from roel_service.mapping.match_points import PointLineMatcher, images_to_match, point_matcher
+from roel_service.mapping.match_points import PointLineMatcher, point_matcher
 from roel_service.mapping.match_sampled import (
     GeometricMatcher,
     LineMatcher,
     match_sampled_frames,
 )
 from roel_service.mapping.merge import merge_duplicates
-from roel_service.mapping.plane_fit import (
-    FittedLines,
-    fit_space_time_planes,
-    observations_of_frames,
-)
 from roel_service.mapping.refine import Refined, refine_lines
-from roel_service.mapping.representations import event_images
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.trim import trim_to_segments
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventSource, EventStream
-from roel_service.scene.lines import LineObservations, LineTracks
+from roel_service.scene.events import EventSource
+from roel_service.scene.lines import LineTracks
 from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
 from roel_service.scene.trajectory import Trajectory
 
@@ -87,9 +73,8 @@ def build_line_map(
     needs_points = matcher is None and config.match_global.matches_points
     points = point_matcher(config.match_global) if needs_points else None
 
-    frames, observations, images = _lines_of_all_frames(
-        counted, trajectory, camera, config, detector, run
-    )
+    detected = lines_of_all_frames(counted, trajectory, camera, config, detector, run)
+    frames, observations, evidence = detected.frames, detected.observations, detected.evidence
     counted.check_coverage()
     with run.stage("match_local"):
         tracks = match_adjacent_frames(
@@ -98,11 +83,10 @@ def build_line_map(
             config.match_local,
             rotation_is_undone=config.frames.compensate_rotation,
         )
-        evidence = measure_evidence(observations, frames, trajectory, config.frames, config.refine)
     if config.match_global.method == "sampled":
         with run.stage("match_global"):
             matcher = matcher or (
-                PointLineMatcher(points, images, evidence.views, config.match_global)
+                PointLineMatcher(points, detected.images, evidence.views, config.match_global)
                 if points
                 else GeometricMatcher(tracks, evidence.views, frames, config)
             )
@@ -174,67 +158,3 @@ def _triangulation_cost(config: Config) -> RefineConfig:
         max_length_weight_px=EQUAL_WEIGHTS_PX,
         iteration_count=steps,
     )
-
-
-def _lines_of_all_frames(
-    events: CountedEvents,
-    trajectory: Trajectory,
-    camera: Camera,
-    config: Config,
-    detector: LineDetector,
-    run: MappingRun,
-) -> tuple[Frames, LineObservations, dict[int, tuple[Array, ...]]]:
-    """Detection and plane fit of every frame; frames are independent and run in threads.
-
-    Returns:
-        the frames, their lines, and the images of sampled frames where point matches need them.
-    """
-    ideal_px = undistortion_table(camera)
-
-    def lines_of_frame(item: tuple[int, tuple[int, EventStream]]) -> _FrameLines:
-        index, (t_us, stream) = item
-        started = time.perf_counter()
-        frame = event_frame(
-            stream, t_us, ideal_px, trajectory, camera, config.frames, config.detect
-        )
-        seeds = detect_lines(event_images(frame, config.detect), detector, config.detect)
-        images = images_to_match(index, frame, config)
-        detected = time.perf_counter()
-        rng = np.random.default_rng(np.random.SeedSequence(config.runtime.seed, spawn_key=(index,)))
-        fitted = fit_space_time_planes(seeds, frame, config.plane_fit, rng)
-        return _FrameLines(
-            t_us=t_us,
-            fitted=fitted,
-            images=images,
-            detect_s=detected - started,
-            plane_fit_s=time.perf_counter() - detected,
-        )
-
-    times_us = frame_times(trajectory, events.time_range_us, config.frames)
-    reach_us = config.frames.max_half_window_us
-    slices = enumerate(frame_slices(events.chunks(), times_us, reach_us))
-    began = time.perf_counter()
-    worker_count = config.runtime.worker_count or os.cpu_count() or 1
-    done: list[_FrameLines] = []
-    for lines in in_order(lines_of_frame, slices, worker_count):
-        done.append(lines)
-        run.step(len(done), len(times_us))
-    run.share_wall_clock(
-        time.perf_counter() - began,
-        {
-            "detect": sum(lines.detect_s for lines in done),
-            "plane_fit": sum(lines.plane_fit_s for lines in done),
-        },
-    )
-    frames = frames_at(np.array([lines.t_us for lines in done], np.int64), trajectory, camera)
-    images = {index: lines.images for index, lines in enumerate(done)}
-    return frames, observations_of_frames([lines.fitted for lines in done]), images
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _FrameLines:
-    t_us: int
-    fitted: FittedLines
-    images: tuple[Array, ...]
-    detect_s: float
-    plane_fit_s: float

@@ -6,7 +6,7 @@ accuracy (its slice at the frame's time) and tells which events support it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -42,6 +42,15 @@ class FittedLines:
     event_offsets: IntArray
     event_xy_px: Array
     event_dt_us: Array
+
+    def without_events(self) -> FittedLines:
+        """The lines alone."""
+        return replace(
+            self,
+            event_offsets=np.zeros(len(self.polarity) + 1, np.int64),
+            event_xy_px=np.empty((0, 2), np.float32),
+            event_dt_us=np.empty(0, np.int32),
+        )
 
 
 def fit_space_time_planes(
