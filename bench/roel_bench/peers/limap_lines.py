@@ -155,11 +155,14 @@ def best_matches(first: FrameLines, second: FrameLines, count: int) -> IntArray:
 
 def hamming_distances(queries: Array, descriptors: Array) -> IntArray:
     """(S, T) bits that differ between (S, 32) queries and the nearer of (2, T, 32) directions."""
-    differences = np.bitwise_count(queries[:, None, None] ^ descriptors[None])
-    return np.asarray(differences.sum(axis=-1, dtype=np.int64).min(axis=1))
+    words, other_words = queries.view(np.uint64), descriptors.view(np.uint64)
+    differences = np.bitwise_count(words[:, None, None] ^ other_words)
+    return np.asarray(differences.sum(axis=-1, dtype=np.uint16).min(axis=1), dtype=np.int64)
 
 
 def _smallest(values: IntArray, count: int) -> BoolArray:
     """(S, T) whether a value is among the smallest `count` of its row; earlier wins a tie."""
-    rank = np.argsort(np.argsort(values, axis=1, kind="stable"), axis=1, kind="stable")
-    return np.asarray(rank < count)
+    if count >= values.shape[1]:
+        return np.ones(values.shape, np.bool_)
+    keys = values * values.shape[1] + np.arange(values.shape[1])
+    return np.asarray(keys <= np.partition(keys, count - 1, axis=1)[:, count - 1 : count])
