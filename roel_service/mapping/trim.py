@@ -16,6 +16,7 @@ from roel_service.arrays import BoolArray, FloatArray, IntArray
 from roel_service.config.stages import TrimConfig
 from roel_service.geometry import plucker
 from roel_service.geometry.vectors import dot, norm
+from roel_service.mapping import trim_kernels
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.refine import Refined
 from roel_service.mapping.views import Views, cuts_m
@@ -86,12 +87,8 @@ def covered_spans(lines: InfiniteLines, tracks: LineTracks, views: Views) -> Flo
     """(L, 2) from the first to the last arc length, m, that enough views cover; NaN without any."""
     cuts = _cuts(lines, tracks, views)
     line_of = tracks.track_of_row[cuts.row]
-    spans = np.full((len(lines), 2), np.nan)
-    for line, rows in _groups(line_of, len(lines)):
-        ends, coverage = _coverage(cuts.interval_m[rows])
-        covered = np.flatnonzero(coverage >= max(1.0, SPAN_COVERAGE_FRACTION * coverage.max()))
-        spans[line] = ends[covered[0]], ends[covered[-1] + 1]
-    return spans
+    offsets = np.searchsorted(line_of, np.arange(len(lines) + 1))
+    return np.asarray(trim_kernels.covered_spans(cuts.interval_m, offsets, SPAN_COVERAGE_FRACTION))
 
 
 def _cuts(lines: InfiniteLines, tracks: LineTracks, views: Views) -> _Cuts:
