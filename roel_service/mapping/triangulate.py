@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
+from roel_service.arrays import BoolArray, FloatArray, IntArray
 from roel_service.config.stages import TriangulateConfig
 from roel_service.geometry import grassmann, plucker, projection, segments
 from roel_service.geometry.se3 import SE3
@@ -23,6 +23,8 @@ from roel_service.scene.results import TrackStatus
 
 # Hypotheses times observations handled at once; bounds memory to some hundred megabytes.
 BATCH_SIZE = 200_000
+# Parent of a track without a hypothesis.
+NO_PAIR = -1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,10 +74,9 @@ def triangulate_tracks(
         config: gates and numbers of trials.
         rng: draws the pairs.
     """
-    statuses = [TrackStatus.TOO_FEW_VIEWS] * len(tracks)
     direction = np.full((len(tracks), 3), np.nan)
     moment = np.full((len(tracks), 3), np.nan)
-    inliers: list[Array] = [np.empty(0, np.int32)] * len(tracks)
+    parent = np.full(len(tracks), NO_PAIR)
     for batch in _batches(tracks, config):
         members, valid = _scored_members(tracks, batch, config.scored_observation_count)
         hypotheses = _hypothesise(views.take(members), valid, config, rng)
@@ -83,28 +84,32 @@ def triangulate_tracks(
         rows = np.arange(len(batch))
         direction[batch] = hypotheses.direction[rows, best]
         moment[batch] = hypotheses.moment[rows, best]
-        parents = members[rows, hypotheses.parent[rows, best]]
-        for row, track in enumerate(batch):
-            if not tried[row]:
-                statuses[track] = TrackStatus.LOW_PARALLAX
-                continue
-            members_of_track = tracks[track]
-            agrees = _inliers(
-                views.take(members_of_track),
-                views.take(parents[row]),
-                direction[track],
-                moment[track],
-                frames,
-                config,
-            )
-            inliers[track] = members_of_track[agrees]
-            enough = len(inliers[track]) >= config.min_inlier_count
-            statuses[track] = TrackStatus.TRIANGULATED if enough else TrackStatus.TOO_FEW_INLIERS
-    good = [track for track, status in enumerate(statuses) if status is TrackStatus.TRIANGULATED]
+        parent[batch] = np.where(tried, members[rows, hypotheses.parent[rows, best]], NO_PAIR)
+    inlier = np.zeros(len(tracks.observation), dtype=bool)
+    rows = np.flatnonzero(parent[tracks.track_of_row] != NO_PAIR)
+    track = tracks.track_of_row[rows]
+    inlier[rows] = _inliers(
+        views.take(tracks.observation[rows]),
+        views.take(parent[track]),
+        direction[track],
+        moment[track],
+        frames,
+        config,
+    )
+    counts = np.bincount(tracks.track_of_row[inlier], minlength=len(tracks))
+    good = (parent != NO_PAIR) & (counts >= config.min_inlier_count)
+    status = np.full(len(tracks), TrackStatus.TRIANGULATED)
+    status[~good] = TrackStatus.TOO_FEW_INLIERS
+    status[parent == NO_PAIR] = TrackStatus.LOW_PARALLAX
+    status[tracks.sizes < config.min_observation_count] = TrackStatus.TOO_FEW_VIEWS
+    kept = inlier & good[tracks.track_of_row]
     return Triangulated(
         lines=InfiniteLines(direction=direction[good], moment=moment[good]),
-        tracks=LineTracks.from_lists([inliers[track] for track in good]),
-        statuses=statuses,
+        tracks=LineTracks(
+            offsets=np.concatenate([[0], np.cumsum(counts[good])]),
+            observation=tracks.observation[kept],
+        ),
+        statuses=status.tolist(),
     )
 
 
@@ -286,6 +291,6 @@ def _inliers(
     frames: Frames,
     config: TriangulateConfig,
 ) -> BoolArray:
-    """(n,) which observations of one track agree with its best line, in front of the camera."""
+    """(n,) which observations agree with the best lines of their tracks, in front of the camera."""
     agreement = _agreement(views, parent, direction, moment, frames, config)
     return _in_front(views, direction, moment) & (agreement > 0)
