@@ -40,8 +40,8 @@ from roel_service.simulate.dataset import SimulationConfig, simulate_dataset
 TUNING_ROOMS = ("room_11", "room_12")
 TUNING_SEEDS = range(101, 110)
 
-LARGE_ROOMS = tuple(f"sim_{seed}_640x480_8s" for seed in range(201, 205))
-SMALL_ROOMS = tuple(f"sim_{seed}_346x260_6s" for seed in range(211, 215))
+LARGE_ROOMS = tuple(f"sim_{seed}_640x480_8s" for seed in range(201, 203))
+SMALL_ROOMS = tuple(f"sim_{seed}_346x260_6s" for seed in range(211, 213))
 REPORTING_ROOMS = LARGE_ROOMS + SMALL_ROOMS
 POSED_RECORDINGS = ("slider_depth", "events_room01")
 POSELESS_RECORDINGS = ("boxes", "disk", "stripes", "building")

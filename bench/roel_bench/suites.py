@@ -23,7 +23,7 @@ from roel_service.errors import InputError
 MAP, FRONT_END = "map", "front_end"
 
 # The tables of single frames have many rows, and the paper's are of one scene.
-FRONT_END_ROOMS = LARGE_ROOMS[:2] + SMALL_ROOMS[:2]
+FRONT_END_ROOMS = LARGE_ROOMS[:1] + SMALL_ROOMS[:1]
 PRESET_NAMES = tuple(variant.name for variant in PRESET_VARIANTS)
 
 
