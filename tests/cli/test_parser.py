@@ -31,7 +31,7 @@ def usage_error(*arguments: str) -> UsageError:
         ),
         (
             ("config", "show", "--preset", "best"),
-            "--preset: expected one of default, paper, found 'best'",
+            "--preset: expected one of default, precise, paper, found 'best'",
         ),
         (
             ("map", "export", "m.rlm", "--out", "m.stl"),

@@ -202,5 +202,5 @@ class TestErrors:
             load_config("default", None, {"runtime": {"seed": -1}})
 
     def test_an_unknown_preset_is_refused(self):
-        with pytest.raises(ConfigError, match="preset: expected one of default, paper"):
+        with pytest.raises(ConfigError, match="preset: expected one of default, precise, paper"):
             load_config("quick")

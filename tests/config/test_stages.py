@@ -172,6 +172,14 @@ class TestPresets:
     def test_the_default_preset_holds_the_defaults(self):
         assert preset("default") == Config()
 
+    def test_the_precise_preset_only_keeps_fewer_lines(self):
+        precise, default = preset("precise"), Config()
+        assert dataclasses.replace(precise, trim=default.trim) == default
+        assert precise.trim.max_sigma_m < default.trim.max_sigma_m
+        assert precise.trim.max_rms_px < default.trim.max_rms_px
+        assert precise.trim.min_support_ratio > default.trim.min_support_ratio
+        assert precise.trim.min_frame_count > default.trim.min_frame_count
+
     def test_the_paper_preset_holds_the_published_values(self):
         paper = preset("paper")
         assert paper.detect.representations == ("binary", "timestamp")
@@ -199,5 +207,7 @@ class TestPresets:
         assert len(set(map(repr, PRESETS.values()))) == len(PRESETS)
 
     def test_an_unknown_preset_names_the_known_ones(self):
-        with pytest.raises(ConfigError, match="expected one of default, paper, found fast"):
+        with pytest.raises(
+            ConfigError, match="expected one of default, precise, paper, found fast"
+        ):
             preset("fast")

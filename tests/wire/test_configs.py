@@ -57,5 +57,5 @@ def test_a_value_out_of_range_names_its_field():
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(ConfigError, match="preset: expected one of default, paper"):
+    with pytest.raises(ConfigError, match="preset: expected one of default, precise, paper"):
         config_from_proto(config_pb2.MappingConfig(), "fast")
