@@ -120,7 +120,15 @@ PAPER_ABLATION_SINGLES = tuple(
 PAPER_ABLATION = (
     _paper("no planes, no refinement", plane_fit=NO_PLANES, refine=NO_STEPS),
     _paper("no refinement", refine=NO_STEPS),
-    _paper("LIMAP's cost", refine={"residual": "reprojection", "event_weight": 0.0}),
+    _paper(
+        "LIMAP's cost",
+        refine={
+            "residual": "reprojection",
+            "loss": "cauchy",
+            "loss_scale_px": 1.0,
+            "event_weight": 0.0,
+        },
+    ),
     _paper("line cost alone", refine={"event_weight": 0.0}),
 )
 
