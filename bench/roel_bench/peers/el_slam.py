@@ -55,12 +55,16 @@ class ElSlamSettings:
         inlier_share: largest distance of an inlier from the line, over its depth.
         min_inlier_count, min_inlier_share: lines with fewer points, or fewer of theirs, are dropped.
         seed: of the trials.
+
+    The defaults were chosen by the mean IoU at 20 mm on the tuning rooms: 0.194, against 0.171 and
+    0.192 for gaps of 3 and 12 px in the Hough transform. Inliers of 0.005, 0.007, 0.015 and 0.02 of
+    the depth, lengths of 10 and 20 px and stricter masks (offsets of 10 and 14) gave less.
     """
 
     emvs: EmvsSettings = field(default_factory=EmvsSettings)
     hough_vote_count: int = 15
     hough_length_px: float = 15.0
-    hough_gap_px: float = 3.0
+    hough_gap_px: float = 8.0
     merge_distance_px: float = 10.0
     merge_angle_deg: float = 10.0
     merge_gap_px_m: float = 5.0

@@ -61,9 +61,9 @@ class EmvsSettings:
 
     The defaults were chosen by the IoU at 20 mm on the tuning rooms, over 100 to 400 planes between
     0.5-6 and 0.8-5 m, windows of 5 to 15 px, offsets of 5 to 14 and key views every 7 to 40 % of
-    the depth. They give 94.7 mm and 0.255 on room 12 (22.0 mm and 0.385 on seed 102). The paper's
-    100 planes gave 0.10 on room 12; an offset of 14 halves the ghosts and costs a quarter of the
-    IoU (11.1 mm and 0.288 on seed 102), which is `EMVS_SETTINGS["strict"]`.
+    the depth. On room 12 they give 0.255 with 95 mm of accuracy (0.385 and 22 mm on seed 102),
+    where the paper's 100 planes gave 0.10. An offset of 14 halves the ghosts (11 mm on seed 102)
+    and costs a quarter of the IoU there: `EMVS_SETTINGS["strict"]`.
     """
 
     min_depth_m: float = 0.7
