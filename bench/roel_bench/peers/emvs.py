@@ -61,8 +61,8 @@ class EmvsSettings:
 
     The defaults were chosen by the IoU at 20 mm on the tuning rooms, over 100 to 400 planes between
     0.5-6 and 0.8-5 m, windows of 5 to 15 px, offsets of 5 to 14 and key views every 7 to 40 % of
-    the depth. On room 12 they give 0.255 with 95 mm of accuracy (0.385 and 22 mm on seed 102),
-    where the paper's 100 planes gave 0.10. An offset of 14 halves the ghosts (11 mm on seed 102)
+    the depth. On room 12 they give 0.27 with 88 mm of accuracy (0.40 and 24 mm on seed 102),
+    where the paper's 100 planes gave 0.10. An offset of 14 halves the ghosts (12 mm on seed 102)
     and costs a quarter of the IoU there: `EMVS_SETTINGS["strict"]`.
     """
 

@@ -418,12 +418,15 @@ def read_segments(path: Path) -> FloatArray:
     return np.asarray(segments, dtype=np.float64)
 
 
-# Chosen by the IoU at 20 mm on room 12, where every 6th, 3rd, 2nd and every frame gave 0.02, 0.08,
-# 0.15 and 0.22 (0.5 px of blur; 1.5 px at every frame: 0.14), 20 to 60 neighbours, 10 or 30 matches
-# 0.205 and 0.210 (0.7 px), windows of 0.1, 0.2 and 0.3 events a pixel 0.141, 0.147 and 0.147.
-# The rows after the first say what each choice is worth; exhaustive matching of every frame takes
-# hours. `own_lines` isolates triangulation and refinement: what it lacks against this project's map
-# is LIMAP's, what it gains against the other rows is the front end's.
+# Chosen by the IoU at 20 mm on room 12: every 6th, 3rd, 2nd and every
+# frame 0.02, 0.08, 0.10 and 0.14 with a blur of 1.5 px; blurs of 1.5, 1.0, 0.7 and 0.5 px at every
+# 2nd frame 0.10, 0.15, 0.15 and 0.17; together 0.22. Windows of 0.1 to 0.3 events a pixel
+# and shortest lines of 7 to 15 px changed it by less than 0.01.
+#
+# The other rows say what each choice is worth. Exhaustive matching grows with the square of the
+# lines, so it has fewer frames. Both flanks of each ridge, some 8 mm off, gain at 20 mm where the
+# scene is near (0.35 against 0.26 on seed 102) and lose all at 5 mm. `own_lines` isolates
+# triangulation and refinement from the front end.
 _BEST = LimapSettings()
 LIMAP_SETTINGS: dict[str, LimapSettings] = {
     "best_10": _BEST,
