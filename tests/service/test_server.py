@@ -50,7 +50,7 @@ def test_capabilities_name_version_limits_presets_and_stages(client):
     answer = client.capabilities()
     assert answer.version == __version__
     assert tuple(answer.stages) == MAPPING_STAGES
-    assert list(answer.presets) == ["default", "paper"]
+    assert list(answer.presets) == ["default", "precise", "paper"]
     assert answer.limits.pose_count == 100
     assert answer.limits.events_per_chunk == 131_072
     assert all(value > 0 for _, value in answer.limits.ListFields())
