@@ -6,6 +6,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Some tests fork in a process in which others have used gRPC. Its fork handlers are for children that
+# go on using it, which none does; where they cannot run they say so on stderr.
+os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
+
 # No limit on time: a busy machine is no failure. Few examples, drawn anew in every run.
 settings.register_profile("project", deadline=None, max_examples=30)
 settings.load_profile("project")
