@@ -199,12 +199,13 @@ def _peers(report: _Report) -> str:
 
 
 def _noise(report: _Report) -> str:
-    lines = []
+    lines, scenes = [], set[str]()
     for disturbance in DISTURBANCES:
         rows = report.maps.rows("default", disturbance=disturbance)
+        scenes.update(rows)
         kept = report.maps.ratio("iou_20", "default", "default", disturbance)
         lines.append([*_map_line(disturbance, rows.values()), number(kept, 2)])
-    undisturbed = _map_line("undisturbed", report.maps.rows("default").values())
+    undisturbed = _default_line(report, "undisturbed", scenes)
     text = (
         "The default on disturbed recordings, mean over all rooms: 15 % noise events, uniform in"
         " space and time; pixels whose threshold is higher by a factor drawn anew for each; 30 %"
@@ -215,9 +216,10 @@ def _noise(report: _Report) -> str:
 
 
 def _ablation(report: _Report) -> str:
-    lines = [[*_map_line("default", report.maps.rows("default").values()), MISSING]]
+    lines, scenes = [], set[str]()
     for variant in variants.DEFAULT_ABLATION:
         rows = report.maps.rows(variant.name)
+        scenes.update(rows)
         if rows:
             ratio = report.maps.ratio("iou_20", variant.name, "default")
             lost = None if ratio is None else 100.0 * (1.0 - ratio)
@@ -227,7 +229,14 @@ def _ablation(report: _Report) -> str:
         " what the part is worth: the share of the IoU at 20 mm that is lost without it."
     )
     headings = ["variant", *MAP_HEADINGS, "IoU 20 lost, %"]
-    return _section("What each part is worth", text, table(headings, lines))
+    default = [*_default_line(report, "default", scenes), MISSING]
+    return _section("What each part is worth", text, table(headings, [default, *lines]))
+
+
+def _default_line(report: _Report, name: str, scenes: set[str]) -> list[str]:
+    """The default on the scenes that it is compared on; on all of them if there are none."""
+    rows = report.maps.rows("default")
+    return _map_line(name, [row for scene, row in rows.items() if scene in (scenes or rows)])
 
 
 def _singles(chosen: Sequence[Variant]) -> list[str]:
