@@ -93,7 +93,7 @@ def direction_prior(refined: Refined, config: RefineConfig) -> DirectionPrior | 
     if config.direction_sigma_deg == 0.0 or len(refined) == 0:
         return None
     lines = _uncertain_directions(refined, config)
-    common = common_directions(refined, config)
+    common = _shared_by_many(lines)
     weight = (config.direction_noise_px / np.deg2rad(config.direction_sigma_deg)) ** 2
     if len(common) == 0:
         return DirectionPrior(direction=lines.direction, weight=np.zeros(len(refined)))
@@ -110,7 +110,11 @@ def common_directions(refined: Refined, config: RefineConfig) -> FloatArray:
         refined: lines with their information.
         config: noise of an observation, and how far lines deviate from a common direction.
     """
-    lines = _uncertain_directions(refined, config)
+    return _shared_by_many(_uncertain_directions(refined, config))
+
+
+def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
+    """(D, 3) unit directions, the most frequent first."""
     lines = lines.take(lines.spread_rad < MAX_SPREAD_RAD)
     votes = np.ones(len(lines.direction))
     by_chance = lines.reach.sum()
