@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray
+from roel_service.arrays import FloatArray
 from roel_service.geometry import projection
 from roel_service.mapping import moments_kernels
 from roel_service.mapping.frames import Frames
@@ -77,22 +77,3 @@ def segment_forms(observations: LineObservations, frames: Frames) -> FloatArray:
     weighted = SEGMENT_WEIGHTS[:, None, None] * rays[..., :, None] * rays[..., None, :]
     forms[:, 3:, 3:] = weighted.sum(axis=1)
     return forms
-
-
-def camera_from_world_lines(frames: Frames, frame: Array, origin: FloatArray) -> FloatArray:
-    """(S, 6, 6) matrices A with (v, m)_camera = A (v, m)_world, moments about an own origin each.
-
-    m_camera = R^T (m - (c - origin) x v).
-
-    Args:
-        frame: (S,) frame of each row.
-        origin: (S, 3) m, world, the point about which the row's moment is taken.
-    """
-    R_camera_world = np.swapaxes(frames.T_world_camera.rotation[frame], -1, -2)
-    centre = frames.T_world_camera.translation[frame] - origin
-    matrices = np.zeros((len(frame), 6, 6))
-    matrices[:, :3, :3] = R_camera_world
-    matrices[:, 3:, 3:] = R_camera_world
-    # Rows of R^T times [c]x: each row r becomes r x c, negated.
-    matrices[:, 3:, :3] = -np.cross(R_camera_world, centre[:, None, :])
-    return matrices

@@ -3,9 +3,20 @@ import pytest
 
 from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3, rotation_from_vector
-from roel_service.mapping.moments import camera_from_world_lines, event_forms, segment_forms
+from roel_service.mapping.moments import event_forms, segment_forms
+from roel_service.mapping.refine_kernels import into_camera
 
 from .synthetic import EXACT_SLOT_US, world
+
+
+def in_cameras(frames, frame, origin, lines):
+    """(S, 6) lines as the cameras see them, from (S, 6) world lines with moments about `origin`."""
+    seen = np.empty_like(lines)
+    for row, k in enumerate(frame):
+        centre = frames.T_world_camera.translation[k] - origin[row]
+        R = frames.T_world_camera.rotation[k]
+        into_camera(R, *centre, lines[row, :3], lines[row, 3:], seen[row])
+    return seen
 
 
 def explicit_form(world, row, event_count=0, own_poses=True):
@@ -57,11 +68,8 @@ def test_slots_share_a_pose():
 def test_exact_events_vanish_on_their_line():
     exact = world()
     forms = event_forms(exact.observations, exact.frames, exact.trajectory, EXACT_SLOT_US, 0)
-    to_camera = camera_from_world_lines(
-        exact.frames, exact.observations.frame, np.zeros((len(exact.observations), 3))
-    )
     lines = np.concatenate([exact.lines.direction, exact.lines.moment], axis=1)[exact.line_of]
-    y = np.einsum("sij,sj->si", to_camera, lines)
+    y = in_cameras(exact.frames, exact.observations.frame, np.zeros((len(lines), 3)), lines)
     cost = np.einsum("si,sij,sj->s", y, forms, y)
     # Pixels are float32: 4e-6 px at f 120 px is 3e-8 rad at 2.5 m.
     assert cost.max() < (1e-7) ** 2
@@ -113,9 +121,9 @@ def test_lines_in_the_camera_frame_have_moments_about_its_centre():
     frame = np.array([0, 5, 23])
     origin = rng.normal(size=(3, 3))
     point, direction = rng.normal(size=(3, 3)), rotation_from_vector(rng.normal(size=(3, 3)))[:, 0]
-    A = camera_from_world_lines(exact.frames, frame, origin)
     about_origin = np.cross(point - origin, direction)
-    y = np.einsum("sij,sj->si", A, np.concatenate([direction, about_origin], axis=1))
+    lines = np.concatenate([direction, about_origin], axis=1)
+    y = in_cameras(exact.frames, frame, origin, lines)
     T_camera_world = exact.frames.T_world_camera[frame].inverse()
     expected_direction = T_camera_world.rotate(direction)
     np.testing.assert_allclose(y[:, :3], expected_direction, rtol=0, atol=1e-14)
