@@ -11,7 +11,7 @@ from pathlib import Path
 from sqlalchemy import Connection, create_engine, event
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from roel_service.store.schema import migrate
+from roel_service.store.migrations import migrate
 
 PRAGMAS = (
     "PRAGMA journal_mode = WAL",

@@ -1,13 +1,10 @@
-"""Tables, and the numbered forward-only migrations that make them."""
+"""Tables as they are now; `migrations` makes them."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from sqlalchemy import (
     BigInteger,
     Column,
-    Connection,
     Float,
     ForeignKey,
     Integer,
@@ -15,10 +12,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
-    text,
 )
-
-from roel_service.errors import StateError
 
 METADATA = MetaData()
 
@@ -105,26 +99,3 @@ OPERATION = Table(
     Column("create_time_us", BigInteger, nullable=False),
     Column("end_time_us", BigInteger, nullable=False),
 )
-
-
-def _create_tables(connection: Connection) -> None:
-    METADATA.create_all(connection)
-
-
-# Migration k leads from version k to k + 1; a released one is never changed.
-MIGRATIONS: tuple[Callable[[Connection], None], ...] = (_create_tables,)
-
-
-def migrate(connection: Connection) -> None:
-    """Bring the tables to the newest version.
-
-    Raises:
-        StateError: the folder was written by a newer release.
-    """
-    version = connection.execute(text("PRAGMA user_version")).scalar_one()
-    if version > len(MIGRATIONS):
-        expected = f"a data folder of version {len(MIGRATIONS)} or older"
-        raise StateError("data folder", expected, f"version {version}", reason="DATA_TOO_NEW")
-    for step in MIGRATIONS[version:]:
-        step(connection)
-    connection.execute(text(f"PRAGMA user_version = {len(MIGRATIONS)}"))

@@ -1,0 +1,31 @@
+"""Numbered steps from one version of a data folder to the next; they only lead forward.
+
+A released step is never changed, and none imports the tables of `schema`: those say how rows look now.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sqlalchemy import Connection, text
+
+from roel_service.errors import StateError
+from roel_service.store.migrations import m001_first_tables
+
+# Step k leads from version k to k + 1.
+MIGRATIONS: tuple[Callable[[Connection], None], ...] = (m001_first_tables.migrate,)
+
+
+def migrate(connection: Connection) -> None:
+    """Bring the tables to the newest version.
+
+    Raises:
+        StateError: the folder was written by a newer release.
+    """
+    version = connection.execute(text("PRAGMA user_version")).scalar_one()
+    if version > len(MIGRATIONS):
+        expected = f"a data folder of version {len(MIGRATIONS)} or older"
+        raise StateError("data folder", expected, f"version {version}", reason="DATA_TOO_NEW")
+    for step in MIGRATIONS[version:]:
+        step(connection)
+    connection.execute(text(f"PRAGMA user_version = {len(MIGRATIONS)}"))
