@@ -7,7 +7,7 @@ INSTALLED := .venv/.installed
 WEIGHTS := .venv/.weights
 LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current no-large-files format proto bench accuracy limap serve
+.PHONY: demo learned test check stubs-are-current no-large-files format proto docs bench accuracy limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -37,6 +37,9 @@ bench: $(INSTALLED)  ## measure the maps; SUITE=full takes hours, needs ROEL_DAT
 
 accuracy: $(INSTALLED)  ## write docs/accuracy.md anew from bench/results/mapping.json
 	$(BIN)/python -m roel_bench.report
+
+docs: $(INSTALLED)  ## write the pages of docs/ that follow from the code anew
+	$(BIN)/python docs/generate.py
 
 limap: $(LIMAP_INSTALLED)  ## the benchmark's peer LIMAP, by itself: its OpenCV would overwrite ours
 

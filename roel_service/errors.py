@@ -26,13 +26,15 @@ class RoelError(Exception):
     """A broken contract, told in one line as `subject: expected ..., found ...`.
 
     Attributes:
-        reason: machine-readable name, stable across releases.
+        reason: machine-readable name, stable across releases; a row of `roel_service.reasons`.
         subject: the file, option or resource the message is about.
         expected: what was expected there.
         found: what was found instead.
+        retry_after_s: the server's word that the same call may succeed after this long, else None.
     """
 
     default_reason: ClassVar[str] = "INTERNAL"
+    retry_after_s: float | None = None
 
     def __init__(
         self, subject: str, expected: str, found: str, *, reason: str | None = None

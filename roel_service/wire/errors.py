@@ -7,11 +7,13 @@ and found, so that a caller far away gets the exception that was raised here.
 from __future__ import annotations
 
 import json
+from datetime import timedelta
 
 from google.rpc import code_pb2, error_details_pb2, status_pb2
 
 from roel_service import errors
 from roel_service.errors import Cancelled, RoelError
+from roel_service.reasons import REASONS
 
 DOMAIN = "roel-service"
 # A status travels in headers, which gRPC refuses beyond 16 KiB: four texts of this length fit even
@@ -60,10 +62,29 @@ def status_from_error(error: RoelError | Cancelled) -> status_pb2.Status:
         info.metadata[key] = getattr(error, key)[:MAX_TEXT_LENGTH]
     if isinstance(error, errors.NoAnswerError) and error.result is not None:
         info.metadata["result"] = json.dumps(error.result)
-    code = next(code for kind, code in CODES if isinstance(error, kind))
-    status = status_pb2.Status(code=code, message=str(error)[:MAX_TEXT_LENGTH])
+    message = str(error)[:MAX_TEXT_LENGTH]
+    status = status_pb2.Status(code=code_of(type(error)), message=message)
     status.details.add().Pack(info)
+    row = REASONS.get(error.reason)
+    if row is not None and row.retry_after_s is not None:
+        retry = error_details_pb2.RetryInfo()
+        retry.retry_delay.FromTimedelta(timedelta(seconds=row.retry_after_s))
+        status.details.add().Pack(retry)
     return status
+
+
+def code_of(kind: type[RoelError]) -> int:
+    """The gRPC code of a class of errors."""
+    return next(code for listed, code in CODES if issubclass(kind, listed))
+
+
+def retry_after_s(status: status_pb2.Status) -> float | None:
+    """How long to wait before the same call; None where the server does not invite to it."""
+    for detail in status.details:
+        retry = error_details_pb2.RetryInfo()
+        if detail.Unpack(retry):
+            return float(retry.retry_delay.ToTimedelta().total_seconds())
+    return None
 
 
 def error_from_status(
@@ -77,6 +98,12 @@ def error_from_status(
     """
     if status.code == code_pb2.CANCELLED:
         return Cancelled(status.message)
+    error = _restored(status, subject)
+    error.retry_after_s = retry_after_s(status)
+    return error
+
+
+def _restored(status: status_pb2.Status, subject: str) -> RoelError:
     info = _error_info(status)
     if info is None:
         kind = FALLBACK.get(status.code, RoelError)

@@ -78,6 +78,7 @@ def refused(tmp_path, text, sensor_size=None):
         read(tmp_path, text, sensor_size)
     assert str(caught.value).startswith(f"{tmp_path / 'camera'}: expected ")
     assert "\n" not in str(caught.value)
+    assert caught.value.reason == "CAMERA_INVALID"
     return str(caught.value)
 
 

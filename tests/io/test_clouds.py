@@ -93,6 +93,7 @@ def test_what_are_no_points_is_refused(tmp_path, arrays, message):
     with pytest.raises(CloudError) as caught:
         read_points(tmp_path / "p.npz", "points")
     assert message in str(caught.value)
+    assert caught.value.reason == "CLOUD_INVALID"
 
 
 def test_too_few_points_are_refused(tmp_path, points):

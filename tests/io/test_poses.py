@@ -24,6 +24,7 @@ def refused(tmp_path, *lines):
     with pytest.raises(TrajectoryError) as caught:
         read_lines(tmp_path, *lines)
     assert caught.value.subject == str(tmp_path / "poses.txt")
+    assert caught.value.reason == "POSES_INVALID"
     assert "\n" not in str(caught.value)
     return str(caught.value)
 

@@ -61,5 +61,6 @@ def test_cameras_are_equal_by_value():
 def test_panorama_covers_the_sphere_once():
     assert Equirectangular(width=2048, height=1024).width == 2048
     for width, height in ((2048, 1000), (0, 0), (-4, -2)):
-        with pytest.raises(PanoramaError, match=f"{width} x {height}"):
+        with pytest.raises(PanoramaError, match=f"{width} x {height}") as caught:
             Equirectangular(width=width, height=height)
+        assert caught.value.reason == "PANORAMA_INVALID"

@@ -204,8 +204,9 @@ def test_an_upload_begins_with_the_name_of_its_recording(upload, stream):
     for requests in ([], [chunk(0, data)], [header(stream), header(stream)]):
         with pytest.raises(InputError):
             upload("AppendEvents", *requests)
-    with pytest.raises(InputError):
+    with pytest.raises(InputError) as caught:
         upload("AppendPoses", poses(trajectory_of(3)))
+    assert caught.value.reason == "UPLOAD_ORDER"
     with pytest.raises(NotFoundError):
         upload("AppendEvents", header("projects/default/eventStreams/nowhere"), chunk(0, data))
 

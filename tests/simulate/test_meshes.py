@@ -68,7 +68,7 @@ def test_what_is_no_mesh_is_refused_by_name(tmp_path, suffix):
     path.write_bytes(bytes(range(256)) * 4)
     with pytest.raises(MeshError) as caught:
         scene_from_mesh(path)
-    assert caught.value.subject == str(path)
+    assert (caught.value.subject, caught.value.reason) == (str(path), "MESH_INVALID")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

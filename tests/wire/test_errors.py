@@ -1,6 +1,3 @@
-import re
-from pathlib import Path
-
 import pytest
 from google.rpc import code_pb2, status_pb2
 from hypothesis import given
@@ -8,15 +5,15 @@ from hypothesis import strategies as st
 
 from roel_service import errors
 from roel_service.errors import Cancelled, InputError, RoelError
+from roel_service.reasons import REASONS
 from roel_service.wire.errors import (
     CODES,
     KINDS,
     MAX_TEXT_LENGTH,
     error_from_status,
+    retry_after_s,
     status_from_error,
 )
-
-ROOT = Path(__file__).parents[2]
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=MAX_TEXT_LENGTH)
 
@@ -50,6 +47,11 @@ def test_codes_are_those_of_the_design(kind, code):
     assert status_from_error(kind("s", "e", "f")).code == code
 
 
+def test_an_error_of_no_particular_reason_has_that_of_its_class():
+    assert errors.NoAnswerError("map", "lines", "none").reason == "NO_ANSWER"
+    assert InputError("--host", "a host", "none").reason == "INPUT_INVALID"
+
+
 def test_no_code_is_shadowed_by_a_base_class_before_it():
     kinds = [kind for kind, _ in CODES]
     for index, kind in enumerate(kinds):
@@ -67,20 +69,30 @@ def test_long_texts_are_cut_to_fit_a_header():
 
 
 @pytest.mark.parametrize(
-    ("code", "kind"),
+    ("code", "kind", "reason"),
     [
-        (code_pb2.UNAVAILABLE, errors.UnavailableError),
-        (code_pb2.DEADLINE_EXCEEDED, errors.UnavailableError),
-        (code_pb2.RESOURCE_EXHAUSTED, errors.LimitError),
-        (code_pb2.UNIMPLEMENTED, RoelError),
+        (code_pb2.INVALID_ARGUMENT, errors.InputError, "INPUT_INVALID"),
+        (code_pb2.FAILED_PRECONDITION, errors.StateError, "WRONG_STATE"),
+        (code_pb2.ABORTED, errors.ConflictError, "CONFLICT"),
+        (code_pb2.DATA_LOSS, errors.CorruptionError, "BLOB_CORRUPT"),
+        (code_pb2.UNAVAILABLE, errors.UnavailableError, "UNAVAILABLE"),
+        (code_pb2.DEADLINE_EXCEEDED, errors.UnavailableError, "UNAVAILABLE"),
+        (code_pb2.RESOURCE_EXHAUSTED, errors.LimitError, "LIMIT_EXCEEDED"),
+        (code_pb2.UNIMPLEMENTED, RoelError, "INTERNAL"),
     ],
 )
-def test_a_status_without_details_names_who_answered(code, kind):
+def test_a_status_without_details_names_who_answered(code, kind, reason):
     status = status_pb2.Status(code=code, message="from gRPC itself")
     error = error_from_status(status, subject="host:1")
-    assert type(error) is kind
+    assert (type(error), error.reason) == (kind, reason)
     assert error.subject == "host:1"
     assert "from gRPC itself" in error.found
+
+
+@pytest.mark.parametrize("row", REASONS.values(), ids=lambda row: row.name)
+def test_where_waiting_helps_the_status_says_how_long(row):
+    status = status_from_error(row.kind("s", "e", "f", reason=row.name))
+    assert retry_after_s(status) == error_from_status(status).retry_after_s == row.retry_after_s
 
 
 def test_an_unknown_kind_of_error_is_still_an_error():
@@ -90,33 +102,3 @@ def test_an_unknown_kind_of_error_is_still_an_error():
     restored = error_from_status(status)
     assert type(restored) is RoelError
     assert restored.args == ("s", "e", "f")
-
-
-def documented_reasons():
-    """Reason, class and code of every row of docs/errors.md."""
-    rows = re.findall(
-        r"^\| `(\w+)` \| `(\w+)` \| (\w+) \|", (ROOT / "docs" / "errors.md").read_text(), re.M
-    )
-    return {reason: (kind, code) for reason, kind, code in rows}
-
-
-def raised_reasons():
-    """Every reason that the source names."""
-    sources = [*(ROOT / "roel_service").rglob("*.py"), *(ROOT / "clients").rglob("*.py")]
-    texts = (path.read_text() for path in sources)
-    return {
-        name for text in texts for name in re.findall(r'reason(?:: [^=]*)? ?= ?"([A-Z_]+)"', text)
-    }
-
-
-def test_the_documented_reasons_are_those_that_can_be_raised():
-    assert set(documented_reasons()) == raised_reasons()
-
-
-def test_documented_codes_and_classes_are_true():
-    for kind, code in documented_reasons().values():
-        status = status_from_error(KINDS[kind]("subject", "expected", "found"))
-        assert code_pb2.Code.Name(status.code) == code
-    defaults = {kind.default_reason: name for name, kind in KINDS.items()}
-    for reason, name in defaults.items():
-        assert documented_reasons()[reason][0] == name

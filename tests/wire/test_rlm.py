@@ -226,6 +226,7 @@ def refused(data):
     with pytest.raises(MapFileError) as caught:
         decode_map(data, subject="m.rlm")
     assert str(caught.value).startswith("m.rlm: expected an undamaged line map, found ")
+    assert caught.value.reason == "MAP_FILE_INVALID"
     return caught.value.found
 
 

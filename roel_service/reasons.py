@@ -1,0 +1,141 @@
+"""Every reason an error can have: the one table behind statuses, `docs/errors.md` and its tests.
+
+Whoever raises a new reason adds its row here, runs `python docs/generate.py`, and writes the test
+that raises it.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import NamedTuple
+
+from roel_service.errors import (
+    CameraError,
+    CloudError,
+    ConfigError,
+    ConflictError,
+    CorruptionError,
+    EventsError,
+    InputError,
+    LimitError,
+    MapFileError,
+    MeshError,
+    NoAnswerError,
+    NotFoundError,
+    PanoramaError,
+    RoelError,
+    StateError,
+    TrajectoryError,
+    UnavailableError,
+)
+
+
+class Reason(NamedTuple):
+    """One row.
+
+    Attributes:
+        name: as in `RoelError.reason` and `ErrorInfo.reason`; never changes its meaning.
+        kind: the class that is raised with it, which decides the gRPC code.
+        when: what happened, for the documentation.
+        retry_after_s: told as `RetryInfo`: the same call may succeed after this long. None where
+            waiting does not help.
+    """
+
+    name: str
+    kind: type[RoelError]
+    when: str
+    retry_after_s: float | None = None
+
+
+_ROWS = (
+    Reason(
+        "INPUT_INVALID",
+        InputError,
+        "an input or option that cannot be used, for no reason listed below",
+    ),
+    Reason("EVENTS_INVALID", EventsError, "an event file that cannot be read"),
+    Reason("NO_EVENTS", EventsError, "a recording without events"),
+    Reason("EVENT_TIME_NOT_MONOTONE", EventsError, "an event that is older than the one before it"),
+    Reason("EVENT_OUT_OF_BOUNDS", EventsError, "an event outside the sensor"),
+    Reason("EVENT_POLARITY_INVALID", EventsError, "a polarity that is none"),
+    Reason("SENSOR_MISMATCH", EventsError, "events of a sensor that is not the camera's"),
+    Reason("CHUNK_MALFORMED", EventsError, "bytes that are no event chunk"),
+    Reason("CHUNK_CRC_MISMATCH", EventsError, "an event chunk that was damaged on its way"),
+    Reason(
+        "UNSUPPORTED_ENCODING",
+        EventsError,
+        "an event chunk of a version or encoding that this release does not know",
+    ),
+    Reason(
+        "UNSUPPORTED_HDF5_FILTER",
+        EventsError,
+        "an event file whose compression this program does not know",
+    ),
+    Reason("POSES_INVALID", TrajectoryError, "poses that are no trajectory"),
+    Reason(
+        "POSE_COVERAGE_INSUFFICIENT", TrajectoryError, "poses that do not cover the time asked for"
+    ),
+    Reason("CAMERA_INVALID", CameraError, "a calibration that cannot be"),
+    Reason(
+        "CONFIG_INVALID",
+        ConfigError,
+        "an unknown table, key or preset, or a value of a wrong type or range",
+    ),
+    Reason("CLOUD_INVALID", CloudError, "a point cloud that cannot be used"),
+    Reason("MESH_INVALID", MeshError, "a mesh that cannot be used"),
+    Reason("PANORAMA_INVALID", PanoramaError, "an image that is no panorama"),
+    Reason("MAP_FILE_INVALID", MapFileError, "a map file that is damaged or of an unknown format"),
+    Reason("ID_INVALID", InputError, "an id that cannot name a resource"),
+    Reason("NAME_INVALID", InputError, "a text that is no resource name"),
+    Reason("PAGE_SIZE_INVALID", InputError, "a negative page size"),
+    Reason("PAGE_TOKEN_INVALID", InputError, "a page token that does not belong to this list"),
+    Reason(
+        "UPLOAD_ORDER", InputError, "an upload that does not begin with the name of its recording"
+    ),
+    Reason("INSECURE_HOST", InputError, "serving another host than loopback without `--insecure`"),
+    Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
+    Reason("TOO_FEW_LINES", NoAnswerError, "a map of fewer than three lines"),
+    Reason("NOT_FOUND", NotFoundError, "a resource that does not exist"),
+    Reason(
+        "WRONG_STATE",
+        StateError,
+        "a resource in another state than the request needs, for no reason listed below",
+    ),
+    Reason("STREAM_FINALIZED", StateError, "an upload to a recording that is frozen"),
+    Reason("STREAM_NOT_FINALIZED", StateError, "a build from a recording that is still open"),
+    Reason("NO_POSES", StateError, "a build from a recording without poses"),
+    Reason("SEQUENCE_GAP", StateError, "a chunk that is not the next one"),
+    Reason("STREAM_IN_USE", StateError, "deleting a recording that a build reads"),
+    Reason("MAP_IN_USE", StateError, "deleting a map that is being built"),
+    Reason("MAP_NOT_ACTIVE", StateError, "fetching a version that is not complete"),
+    Reason("OPERATION_RUNNING", StateError, "deleting an operation that has not ended"),
+    Reason("DATA_IN_USE", StateError, "a data folder that another server has open"),
+    Reason("DATA_TOO_NEW", StateError, "a data folder that a newer release wrote"),
+    Reason("CONFLICT", ConflictError, "somebody else was faster, for no reason listed below"),
+    Reason("ALREADY_EXISTS", ConflictError, "creating what exists"),
+    Reason("CHUNK_CONFLICT", ConflictError, "a chunk that was stored before with other bytes"),
+    Reason("LIMIT_EXCEEDED", LimitError, "something too large, for no reason listed below"),
+    Reason("EVENT_STREAM_TOO_LARGE", LimitError, "a recording beyond the server's limit"),
+    Reason("TOO_MANY_POSES", LimitError, "more poses than the server takes"),
+    Reason("QUEUE_FULL", LimitError, "more work than the server lets wait", retry_after_s=5.0),
+    Reason("UNAVAILABLE", UnavailableError, "a server that cannot be reached"),
+    Reason("DRAINING", UnavailableError, "a server that is about to end", retry_after_s=2.0),
+    Reason(
+        "WORKER_LOST",
+        UnavailableError,
+        "a build whose process was killed, or whose server was",
+        retry_after_s=1.0,
+    ),
+    Reason(
+        "BLOB_CORRUPT",
+        CorruptionError,
+        "stored or received bytes that do not match their digest",
+    ),
+    Reason(
+        "INTERNAL",
+        RoelError,
+        "a fault of the program; the message names the entry in the server's log",
+    ),
+)
+
+REASONS = MappingProxyType({row.name: row for row in _ROWS})
