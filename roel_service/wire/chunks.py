@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,12 @@ import zstandard
 from roel_service.arrays import Array, IntArray
 from roel_service.errors import EventsError
 from roel_service.scene.events import EventSource, EventStream, concatenate
-from roel_service.wire.byte_planes import integers_from_planes, planes_from_integers
+from roel_service.wire.byte_planes import (
+    integers_from_planes,
+    largest_of_planes,
+    planes_from_integers,
+    sum_of_planes,
+)
 
 MAX_CHUNK_EVENT_COUNT = 131_072
 # Longest time between neighbours in a chunk: what four bytes hold.
@@ -26,7 +32,18 @@ MAX_STEP_US = 2**32 - 1
 _MAGIC = b"REC1"
 _VERSION = 1
 _COLUMNAR_ZSTD = 1
-_ZSTD_LEVEL = 3
+# Byte planes hold hardly a repetition worth finding: what counts is the entropy coder. A tiny table
+# of long matches finds those few, and is faster and smaller than level 3 (on a simulated room 2.66
+# against 2.68 bytes per event, three quarters of the time).
+_ZSTD_PARAMETERS = zstandard.ZstdCompressionParameters(
+    strategy=zstandard.STRATEGY_FAST,
+    window_log=20,
+    hash_log=6,
+    chain_log=6,
+    search_log=1,
+    min_match=7,
+    target_length=0,
+)
 _HEADER = struct.Struct("<4sBBBBIIqqHHII")
 # The header ends in the CRC of all its other bytes.
 _CRC = struct.Struct("<I")
@@ -51,6 +68,33 @@ class _Header(NamedTuple):
     height: int
     payload_crc: int
     reserved: int
+
+
+class _Planes(NamedTuple):
+    """The parts of a payload, uint8 each: planes of three columns, and polarity bits."""
+
+    steps: Array
+    x: Array
+    y: Array
+    signs: Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChunkSummary:
+    """What is worth knowing of a chunk without its events.
+
+    Attributes:
+        t0_us, t1_us: first and last event.
+        width, height: sensor size, px.
+        longest_step_us: longest time between two neighbouring events.
+    """
+
+    event_count: int
+    t0_us: int
+    t1_us: int
+    width: int
+    height: int
+    longest_step_us: int
 
 
 def split_chunks(source: EventSource) -> Iterator[EventStream]:
@@ -98,18 +142,21 @@ def encode_chunk(events: EventStream) -> bytes:
     count = len(events)
     if not 1 <= count <= MAX_CHUNK_EVENT_COUNT:
         raise _malformed(f"1 to {MAX_CHUNK_EVENT_COUNT} events", f"{count}")
-    steps_us = np.diff(events.t_us, prepend=events.t_us[0])
+    steps_us = np.zeros(count, np.int64)
+    np.subtract(events.t_us[1:], events.t_us[:-1], out=steps_us[1:])
     longest_us = int(steps_us.max())
     if longest_us > MAX_STEP_US:
         raise _malformed(f"steps of at most {MAX_STEP_US} us", f"{longest_us} us")
     width_bytes = 2 if longest_us < 2**16 else 4
     planes = (
-        planes_from_integers(steps_us, width_bytes),
+        planes_from_integers(steps_us.astype(f"u{width_bytes}"), width_bytes),
         planes_from_integers(events.x, 2),
         planes_from_integers(events.y, 2),
         np.packbits(events.polarity > 0, bitorder="little").tobytes(),
     )
-    payload = zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(b"".join(planes))
+    payload = zstandard.ZstdCompressor(compression_params=_ZSTD_PARAMETERS).compress(
+        b"".join(planes)
+    )
     header = _HEADER.pack(
         *_Header(
             magic=_MAGIC,
@@ -141,11 +188,7 @@ def decode_chunk(data: bytes, *, previous_t1_us: int | None) -> EventStream:
         EventsError: UNSUPPORTED_ENCODING, CHUNK_CRC_MISMATCH, CHUNK_MALFORMED,
             EVENT_TIME_NOT_MONOTONE or EVENT_OUT_OF_BOUNDS.
     """
-    header = _read_header(data)
-    payload = data[_HEADER_BYTES:]
-    if header.payload_length != len(payload):
-        raise _malformed(f"a payload of {header.payload_length} bytes", f"{len(payload)}")
-    _check_crc("payload", payload, header.payload_crc)
+    header, planes = _opened(data)
     if previous_t1_us is not None and header.t0_us < previous_t1_us:
         raise EventsError(
             _SUBJECT,
@@ -153,17 +196,58 @@ def decode_chunk(data: bytes, *, previous_t1_us: int | None) -> EventStream:
             f"{header.t0_us} us",
             reason="EVENT_TIME_NOT_MONOTONE",
         )
+    return EventStream(
+        t_us=_times(integers_from_planes(planes.steps, header.width_bytes), header),
+        x=integers_from_planes(planes.x, 2),
+        y=integers_from_planes(planes.y, 2),
+        polarity=_polarity(planes.signs, header.event_count),
+        width=header.width,
+        height=header.height,
+    )
+
+
+def check_chunk(data: bytes) -> ChunkSummary:
+    """What a chunk holds, if `decode_chunk` accepts it; several times faster.
+
+    Raises:
+        EventsError: as `decode_chunk`.
+    """
+    header, planes = _opened(data)
+    if not _is_sound(header, planes):
+        decode_chunk(data, previous_t1_us=None)
+    return ChunkSummary(
+        event_count=header.event_count,
+        t0_us=header.t0_us,
+        t1_us=header.t1_us,
+        width=header.width,
+        height=header.height,
+        longest_step_us=largest_of_planes(planes.steps, header.width_bytes),
+    )
+
+
+def _opened(data: bytes) -> tuple[_Header, _Planes]:
+    """Header and decompressed payload of a chunk whose sizes and checksums are right."""
+    header = _read_header(data)
+    payload = memoryview(data)[_HEADER_BYTES:]
+    if header.payload_length != len(payload):
+        raise _malformed(f"a payload of {header.payload_length} bytes", f"{len(payload)}")
+    _check_crc("payload", payload, header.payload_crc)
     width_bytes, count = header.width_bytes, header.event_count
     ends = np.cumsum([width_bytes * count, 2 * count, 2 * count, -(-count // 8)])
     planes = _decompressed(payload, int(ends[-1]))
-    steps, x, y, signs = np.split(planes, ends[:-1])
-    return EventStream(
-        t_us=_times(integers_from_planes(steps, width_bytes), header),
-        x=integers_from_planes(x, 2),
-        y=integers_from_planes(y, 2),
-        polarity=_polarity(signs, count),
-        width=header.width,
-        height=header.height,
+    return header, _Planes(*np.split(planes, ends[:-1]))
+
+
+def _is_sound(header: _Header, planes: _Planes) -> bool:
+    """Whether `decode_chunk` would accept the planes, told without putting integers together."""
+    width_bytes, count = header.width_bytes, header.event_count
+    first_step_us = integers_from_planes(planes.steps[::count], width_bytes)[0]
+    return bool(
+        first_step_us == 0
+        and sum_of_planes(planes.steps, width_bytes) == header.t1_us - header.t0_us
+        and largest_of_planes(planes.x, 2) < header.width
+        and largest_of_planes(planes.y, 2) < header.height
+        and not _has_padding(planes.signs, count)
     )
 
 
@@ -197,15 +281,20 @@ def _times(steps: Array, header: _Header) -> IntArray:
     return np.asarray(elapsed_us + header.t0_us)
 
 
+def _has_padding(bits: Array, count: int) -> bool:
+    """Whether a bit behind the last event is set."""
+    return bool(count % 8 and bits[-1] >> count % 8)
+
+
 def _polarity(bits: Array, count: int) -> Array:
     """(K,) int8, -1 or +1."""
-    if count % 8 and bits[-1] >> count % 8:
+    if _has_padding(bits, count):
         raise _malformed("polarity bits padded with 0", "a 1 behind the last event")
     signs = np.unpackbits(bits, count=count, bitorder="little").view(np.int8)
     return np.asarray(signs * np.int8(2) - np.int8(1))
 
 
-def _check_crc(part: str, data: bytes, expected: int) -> None:
+def _check_crc(part: str, data: bytes | memoryview, expected: int) -> None:
     if zlib.crc32(data) != expected:
         raise EventsError(
             _SUBJECT,
@@ -215,7 +304,7 @@ def _check_crc(part: str, data: bytes, expected: int) -> None:
         )
 
 
-def _decompressed(payload: bytes, size: int) -> Array:
+def _decompressed(payload: memoryview, size: int) -> Array:
     """(size,) uint8; the frame has to declare just this size."""
     try:
         declared = zstandard.get_frame_parameters(payload).content_size

@@ -13,6 +13,8 @@ from roel_service.scene.events import EventStream
 from roel_service.wire.chunks import (
     MAX_CHUNK_EVENT_COUNT,
     MAX_STEP_US,
+    ChunkSummary,
+    check_chunk,
     decode_chunk,
     encode_chunk,
     split_chunks,
@@ -72,6 +74,18 @@ def test_decoded_chunk_is_the_encoded_stream(events):
     assert_same_events(decode_chunk(encode_chunk(events), previous_t1_us=None), events)
 
 
+@given(streams())
+def test_a_checked_chunk_is_summarized(events):
+    assert check_chunk(encode_chunk(events)) == ChunkSummary(
+        event_count=len(events),
+        t0_us=events.t_us[0],
+        t1_us=events.t_us[-1],
+        width=events.width,
+        height=events.height,
+        longest_step_us=max(np.diff(events.t_us), default=0),
+    )
+
+
 def test_layout_is_as_documented():
     # Nine events, so that the polarity bits need a second byte.
     t_us = np.array([-5, -5, 0, 300, 65_835, 65_836, 65_836, 65_837, 65_838])
@@ -128,6 +142,10 @@ def refused(data, previous_t1_us=None):
     with pytest.raises(EventsError) as caught:
         decode_chunk(data, previous_t1_us=previous_t1_us)
     assert caught.value.subject in ("event chunk", "events")
+    if previous_t1_us is None:
+        with pytest.raises(EventsError) as checked:
+            check_chunk(data)
+        assert str(checked.value) == str(caught.value)
     return caught.value.reason
 
 
@@ -201,8 +219,9 @@ def test_payload_that_does_not_fit_is_refused():
 def test_any_payload_is_refused_or_valid(payload):
     changes = {"payload_length": len(payload), "crc": zlib.crc32(payload)}
     with contextlib.suppress(EventsError):
-        decoded = decode_chunk(with_field(CHUNK[:48] + payload, **changes), previous_t1_us=None)
-        assert len(decoded) == 9
+        data = with_field(CHUNK[:48] + payload, **changes)
+        decoded = decode_chunk(data, previous_t1_us=None)
+        assert len(decoded) == check_chunk(data).event_count == 9
 
 
 def test_chunk_may_begin_when_the_one_before_ends_but_not_earlier():
