@@ -247,7 +247,7 @@ class Operation:
                 self._update_seq = answer.update_seq
                 if answer.operation.done:
                     return answer.operation
-                metadata = maps_pb2.BuildMapMetadata()
+                metadata = roel_operations_pb2.OperationMetadata()
                 answer.operation.metadata.Unpack(metadata)
                 progress(progress_from_proto(metadata))
         raise RoelError(self.name, "an operation that ends", "a watch that ended before it")

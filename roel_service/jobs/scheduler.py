@@ -12,7 +12,7 @@ from roel_service.jobs.faults import logged_fault
 from roel_service.jobs.supervisor import run_in_child
 from roel_service.jobs.task import TaskSpec
 from roel_service.progress import Progress
-from roel_service.store.builds import Builds
+from roel_service.store.operations import Operations
 from roel_service.store.records import OperationRecord
 from roel_service.wire.errors import status_from_error
 
@@ -44,13 +44,13 @@ class Scheduler:
     """Runs builds in children and keeps their operations true.
 
     Args:
-        builds: where operations live.
+        operations: where they live.
         concurrent_count: children at a time.
         queued_count: builds that may wait for a child.
     """
 
-    def __init__(self, builds: Builds, concurrent_count: int, queued_count: int) -> None:
-        self._builds = builds
+    def __init__(self, operations: Operations, concurrent_count: int, queued_count: int) -> None:
+        self._operations = operations
         self._children = asyncio.Semaphore(concurrent_count)
         self._free_count = concurrent_count + queued_count
         self._tasks: dict[str, asyncio.Task[None]] = {}
@@ -91,7 +91,7 @@ class Scheduler:
         """Fail what a server that died left behind."""
         found = "a server that ended during the build"
         lost = UnavailableError("build", "a worker that finishes", found, reason="WORKER_LOST")
-        for record in await asyncio.to_thread(self._builds.unfinished):
+        for record in await asyncio.to_thread(self._operations.unfinished):
             await self._fail(record.id, lost)
 
     async def _begin(self, begin: BeginBuild) -> OperationRecord:
@@ -112,12 +112,12 @@ class Scheduler:
 
     async def _run(self, operation_id: str, spec: TaskSpec) -> None:
         """One build from its turn to its end, however it ends."""
-        advance = partial(self._record, self._builds.advance, operation_id)
+        advance = partial(self._record, self._operations.advance, operation_id)
         try:
             async with self._children:
                 await advance(STARTING)
                 built = await run_in_child(spec, advance)
-            await self._record(self._builds.succeed, operation_id, built)
+            await self._record(self._operations.succeed, operation_id, built)
         except asyncio.CancelledError:
             await self._cancelled(operation_id)
         except RoelError as error:
@@ -131,15 +131,15 @@ class Scheduler:
             error = UnavailableError("server", "one that builds", found, reason="DRAINING")
             await self._fail(operation_id, error)
         else:
-            await self._record(self._builds.cancel, operation_id)
+            await self._record(self._operations.cancel, operation_id)
 
     async def _fail(self, operation_id: str, error: RoelError) -> None:
         status = status_from_error(error).SerializeToString(deterministic=True)
-        await self._record(self._builds.fail, operation_id, status)
+        await self._record(self._operations.fail, operation_id, status)
 
     async def _record(self, change: Callable[..., OperationRecord], *arguments: object) -> None:
         """Make a change durable, then tell whoever waits for it."""
         record = await asyncio.to_thread(change, *arguments)
         if record.state.is_final:
-            logger.info("operation %s of map %s: %s", record.id, record.map_id, record.state.value)
+            logger.info("%s %s: %s", record.method.value, record.id, record.state.value)
         self.changes.announce()

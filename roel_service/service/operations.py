@@ -1,4 +1,4 @@
-"""google.longrunning.Operations and OperationService: builds are watched and ended."""
+"""google.longrunning.Operations and OperationService: operations are watched and ended."""
 
 from __future__ import annotations
 
@@ -11,8 +11,12 @@ from google.protobuf.empty_pb2 import Empty
 
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.paging import page_of, page_request
-from roel_service.service.records import operation_to_proto
-from roel_service.store.records import OperationRecord, OperationState
+from roel_service.service.records import (
+    event_stream_to_proto,
+    map_version_to_proto,
+    operation_to_proto,
+)
+from roel_service.store.records import OperationMethod, OperationRecord, OperationState
 from roel_service.store.store import Store
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.wire import names
@@ -34,7 +38,7 @@ class OperationServicer:
         self, request: operations_pb2.ListOperationsRequest, context: Any
     ) -> operations_pb2.ListOperationsResponse:
         wanted = page_request("operations", request.page_size, request.page_token)
-        fetch = self._store.builds.page
+        fetch = self._store.operations.page
         page = await asyncio.to_thread(page_of, wanted, fetch, lambda item: item.id)
         return operations_pb2.ListOperationsResponse(
             operations=[await self._encoded(item) for item in page.items],
@@ -52,7 +56,7 @@ class OperationServicer:
         self, request: operations_pb2.DeleteOperationRequest, context: Any
     ) -> Empty:
         operation_id = names.operation_id(request.name)
-        await asyncio.to_thread(self._store.builds.delete, operation_id)
+        await asyncio.to_thread(self._store.operations.delete, operation_id)
         return Empty()
 
     async def WaitOperation(
@@ -92,11 +96,16 @@ class OperationServicer:
             await changed.wait()
 
     async def _record(self, operation_id: str) -> OperationRecord:
-        return await asyncio.to_thread(self._store.builds.get, operation_id)
+        return await asyncio.to_thread(self._store.operations.get, operation_id)
 
     async def _encoded(self, record: OperationRecord) -> operations_pb2.Operation:
-        version = None
+        answer = None
         if record.state is OperationState.SUCCEEDED:
-            maps = self._store.maps
-            version = await asyncio.to_thread(maps.version, record.map_id, record.version)
-        return operation_to_proto(record, version)
+            answer = await asyncio.to_thread(self._answer, record)
+        return operation_to_proto(record, answer)
+
+    def _answer(self, record: OperationRecord) -> Any:
+        """What the method answers: the resource that it made, as it is now."""
+        if record.method is OperationMethod.IMPORT_EVENT_STREAM:
+            return event_stream_to_proto(self._store.event_streams.get(record.event_stream_id))
+        return map_version_to_proto(self._store.maps.version(record.map_id, record.version))

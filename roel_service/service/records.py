@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from google.longrunning import operations_pb2
+from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from google.rpc import status_pb2
 
@@ -12,12 +15,14 @@ from roel_service.store.records import (
     EventStreamRecord,
     MapRecord,
     MapVersionRecord,
+    OperationMethod,
     OperationRecord,
     OperationState,
     StreamState,
     VersionState,
 )
 from roel_service.v1 import events_pb2, maps_pb2, types_pb2
+from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.wire import names
 from roel_service.wire.errors import status_from_error
 from roel_service.wire.nouns import bounds_to_proto, camera_to_proto
@@ -80,10 +85,8 @@ def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
     return message
 
 
-def operation_to_proto(
-    record: OperationRecord, version: MapVersionRecord | None
-) -> operations_pb2.Operation:
-    """An operation; one that SUCCEEDED answers with the version it built."""
+def operation_to_proto(record: OperationRecord, answer: Message | None) -> operations_pb2.Operation:
+    """An operation; `answer` is that of one that SUCCEEDED."""
     operation = operations_pb2.Operation(
         name=names.operation_name(record.id), done=record.state.is_final
     )
@@ -92,24 +95,39 @@ def operation_to_proto(
         operation.error.CopyFrom(status_from_error(Cancelled()))
     elif record.state is OperationState.FAILED:
         operation.error.CopyFrom(status_pb2.Status.FromString(record.error))
-    elif version is not None:
-        operation.response.Pack(map_version_to_proto(version))
+    elif answer is not None:
+        operation.response.Pack(answer)
     return operation
 
 
-def _metadata(record: OperationRecord) -> maps_pb2.BuildMapMetadata:
-    metadata = maps_pb2.BuildMapMetadata(
-        map_version=names.map_version_name(record.map_id, record.version),
-        stage=record.stage,
-        done_count=record.done_count,
-        total_count=record.total_count,
-        fraction=record.fraction,
-        update_seq=record.update_seq,
-        create_time=_timestamp(record.create_time_us),
-    )
+def _metadata(record: OperationRecord) -> roel_operations_pb2.OperationMetadata:
+    """What the columns say, beside what else the scheduler knows of the work."""
+    metadata = roel_operations_pb2.OperationMetadata.FromString(record.metadata)
+    metadata.method = record.method.value
+    metadata.target = _TARGETS[record.method](record)
+    for name in ("stage", "done_count", "total_count", "fraction", "update_seq"):
+        setattr(metadata, name, getattr(record, name))
+    metadata.create_time.CopyFrom(_timestamp(record.create_time_us))
     if record.state.is_final:
         metadata.end_time.CopyFrom(_timestamp(record.end_time_us))
+        metadata.expire_time.CopyFrom(_timestamp(record.expire_time_us))
     return metadata
+
+
+def _version_name(record: OperationRecord) -> str:
+    return names.map_version_name(record.map_id, record.version)
+
+
+def _stream_name(record: OperationRecord) -> str:
+    return names.event_stream_name(record.event_stream_id)
+
+
+# The resource that each method makes.
+_TARGETS: dict[OperationMethod, Callable[[OperationRecord], str]] = {
+    OperationMethod.BUILD_MAP: _version_name,
+    OperationMethod.IMPORT_MAP: _version_name,
+    OperationMethod.IMPORT_EVENT_STREAM: _stream_name,
+}
 
 
 def _timestamp(time_us: int) -> Timestamp:

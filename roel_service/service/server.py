@@ -76,7 +76,7 @@ async def serve(
     _check_host(host, insecure)
     stop = _stop_at_signals()
     with Store(data) as store:
-        scheduler = Scheduler(store.builds, settings.concurrent_builds, settings.queued_builds)
+        scheduler = Scheduler(store.operations, settings.concurrent_builds, settings.queued_builds)
         await scheduler.fail_unfinished()
         server = grpc.aio.server(
             interceptors=[ErrorInterceptor()], options=_options(settings), compression=None

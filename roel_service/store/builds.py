@@ -1,28 +1,23 @@
-"""Operations: each builds one map version, and both end together."""
+"""Operations that make a map version: the version begins and ends with its operation."""
 
 from __future__ import annotations
 
-import dataclasses
-import uuid
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, delete, insert, select, update
+from sqlalchemy import Connection, insert, update
 
-from roel_service.errors import NotFoundError, StateError
-from roel_service.progress import Progress
+from roel_service.errors import StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.event_streams import get_finalized
 from roel_service.store.maps import get_map
+from roel_service.store.operations import queued_operation
 from roel_service.store.records import (
-    UNFINISHED,
     MapVersionRecord,
+    OperationMethod,
     OperationRecord,
-    OperationState,
     VersionState,
-    now_us,
-    operation_from_row,
     row_from_record,
     stored,
 )
@@ -46,13 +41,12 @@ class BuiltVersion:
 
 
 class Builds:
-    """Repository of operations. Every method that changes something is durable on return."""
+    """Begins the operations that make a map version."""
 
-    def __init__(self, database: Database, blobs: BlobStore) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
-        self._blobs = blobs
 
-    def begin(self, map_id: str, stream_id: str) -> OperationRecord:
+    def begin(self, map_id: str, stream_id: str, request_sha256: str = "") -> OperationRecord:
         """A new version and the operation that builds it.
 
         Raises:
@@ -60,127 +54,60 @@ class Builds:
             StateError: STREAM_NOT_FINALIZED, or NO_POSES.
         """
         with self._database.write() as connection:
-            version_number = get_map(connection, map_id).version_count + 1
+            version = get_map(connection, map_id).version_count + 1
             if get_finalized(connection, stream_id).pose_count == 0:
                 raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
-            operation = _queued(map_id, version_number, stream_id)
-            counted = update(MAP).where(MAP.c.id == map_id)
-            connection.execute(counted.values(version_count=version_number))
-            connection.execute(insert(MAP_VERSION), row_from_record(_creating(operation)))
-            connection.execute(insert(OPERATION), row_from_record(operation))
+            operation = queued_operation(
+                OperationMethod.BUILD_MAP,
+                request_sha256=request_sha256,
+                map_id=map_id,
+                version=version,
+                event_stream_id=stream_id,
+            )
+            insert_version(connection, operation)
         return operation
 
-    def advance(self, operation_id: str, progress: Progress) -> OperationRecord:
-        """Record how far a build is."""
+
+class VersionCompletion:
+    """The version is ACTIVE when its operation SUCCEEDED, and FAILED however else it ended."""
+
+    def __init__(self, blobs: BlobStore) -> None:
+        self._blobs = blobs
+
+    def succeed(
+        self, connection: Connection, operation: OperationRecord, outcome: BuiltVersion
+    ) -> bytes:
+        """Store the map file, then the row that names it; the version is the answer."""
+        # The blob comes first: a crash leaves an unused blob, never a dangling version.
         changes = {
-            "state": OperationState.RUNNING,
-            "stage": progress.stage,
-            "done_count": progress.done_count,
-            "total_count": progress.total_count,
-            "fraction": progress.fraction,
+            "state": VersionState.ACTIVE,
+            "sha256": self._blobs.put(outcome.rlm_bytes),
+            "size_bytes": len(outcome.rlm_bytes),
+            "line_count": outcome.line_count,
+            "bounds_m": outcome.bounds_m,
+            "report": outcome.report,
         }
-        with self._database.write() as connection:
-            return _change(connection, operation_id, changes)
+        _change_version(connection, operation, changes)
+        return b""
 
-    def succeed(self, operation_id: str, built: BuiltVersion) -> OperationRecord:
-        """The operation SUCCEEDED and its version is ACTIVE."""
-        operation = {"state": OperationState.SUCCEEDED, "fraction": 1.0, "end_time_us": now_us()}
-        with self._database.write() as connection:
-            # The blob comes first: a crash leaves an unused blob, never a dangling version.
-            version = {
-                "state": VersionState.ACTIVE,
-                "sha256": self._blobs.put(built.rlm_bytes),
-                "size_bytes": len(built.rlm_bytes),
-                "line_count": built.line_count,
-                "bounds_m": built.bounds_m,
-                "report": built.report,
-            }
-            return _change(connection, operation_id, operation, version)
-
-    def fail(self, operation_id: str, error: bytes) -> OperationRecord:
-        """The operation and its version FAILED; the caller encodes the error."""
-        operation = {"state": OperationState.FAILED, "error": error, "end_time_us": now_us()}
-        with self._database.write() as connection:
-            return _change(connection, operation_id, operation, {"state": VersionState.FAILED})
-
-    def cancel(self, operation_id: str) -> OperationRecord:
-        """The operation is CANCELLED and its version FAILED."""
-        operation = {"state": OperationState.CANCELLED, "end_time_us": now_us()}
-        with self._database.write() as connection:
-            return _change(connection, operation_id, operation, {"state": VersionState.FAILED})
-
-    def get(self, operation_id: str) -> OperationRecord:
-        """One operation; raises `NotFoundError`."""
-        with self._database.read() as connection:
-            return _get(connection, operation_id)
-
-    def page(self, after_id: str, limit: int) -> list[OperationRecord]:
-        """Operations with an id above `after_id`, in the order of ids."""
-        query = select(OPERATION).where(OPERATION.c.id > after_id)
-        with self._database.read() as connection:
-            rows = connection.execute(query.order_by(OPERATION.c.id).limit(limit)).mappings()
-            return [operation_from_row(row) for row in rows]
-
-    def unfinished(self) -> list[OperationRecord]:
-        """Operations that are queued or running."""
-        query = select(OPERATION).where(OPERATION.c.state.in_([item.value for item in UNFINISHED]))
-        with self._database.read() as connection:
-            return [operation_from_row(row) for row in connection.execute(query).mappings()]
-
-    def delete(self, operation_id: str) -> None:
-        """Forget an operation, not its version; raises `StateError` OPERATION_RUNNING."""
-        with self._database.write() as connection:
-            record = _get(connection, operation_id)
-            if not record.state.is_final:
-                expected = "an operation that has ended"
-                reason = "OPERATION_RUNNING"
-                raise StateError(operation_id, expected, record.state.value, reason=reason)
-            connection.execute(delete(OPERATION).where(OPERATION.c.id == operation_id))
+    def fail(self, connection: Connection, operation: OperationRecord) -> None:
+        """The version stays, as FAILED."""
+        _change_version(connection, operation, {"state": VersionState.FAILED})
 
 
-def _change(
-    connection: Connection,
-    operation_id: str,
-    operation_changes: dict[str, Any],
-    version_changes: dict[str, Any] | None = None,
-) -> OperationRecord:
-    """Change an operation and its version; one that is final stays as it is."""
-    record = _get(connection, operation_id)
-    if record.state.is_final:
-        return record
-    changes = {**operation_changes, "update_seq": record.update_seq + 1}
-    operation = update(OPERATION).where(OPERATION.c.id == operation_id)
-    connection.execute(operation.values(stored(changes)))
-    if version_changes is not None:
-        version = update(MAP_VERSION).where(MAP_VERSION.c.operation_id == operation_id)
-        connection.execute(version.values(stored(version_changes)))
-    return dataclasses.replace(record, **changes)
+def insert_version(connection: Connection, operation: OperationRecord) -> None:
+    """An operation that makes a version, with that version, the newest of its map."""
+    counted = update(MAP).where(MAP.c.id == operation.map_id)
+    connection.execute(counted.values(version_count=operation.version))
+    connection.execute(insert(MAP_VERSION), row_from_record(_creating(operation)))
+    connection.execute(insert(OPERATION), row_from_record(operation))
 
 
-def _get(connection: Connection, operation_id: str) -> OperationRecord:
-    query = select(OPERATION).where(OPERATION.c.id == operation_id)
-    row = connection.execute(query).mappings().one_or_none()
-    if row is None:
-        raise NotFoundError("operation", "an existing one", operation_id)
-    return operation_from_row(row)
-
-
-def _queued(map_id: str, version: int, stream_id: str) -> OperationRecord:
-    return OperationRecord(
-        id=uuid.uuid4().hex,
-        map_id=map_id,
-        version=version,
-        event_stream_id=stream_id,
-        state=OperationState.QUEUED,
-        stage="",
-        done_count=0,
-        total_count=0,
-        fraction=0.0,
-        error=b"",
-        update_seq=1,
-        create_time_us=now_us(),
-        end_time_us=0,
-    )
+def _change_version(
+    connection: Connection, operation: OperationRecord, changes: dict[str, Any]
+) -> None:
+    row = update(MAP_VERSION).where(MAP_VERSION.c.operation_id == operation.id)
+    connection.execute(row.values(stored(changes)))
 
 
 def _creating(operation: OperationRecord) -> MapVersionRecord:

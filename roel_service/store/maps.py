@@ -56,6 +56,7 @@ class Maps:
                 raise StateError(map_id, "no build", "one at work", reason="MAP_IN_USE")
             of_map = select(MAP_VERSION.c.sha256).where(MAP_VERSION.c.map_id == map_id)
             digests = set(connection.scalars(of_map))
+            connection.execute(delete(OPERATION).where(OPERATION.c.map_id == map_id))
             connection.execute(delete(MAP).where(MAP.c.id == map_id))
         delete_unreferenced(self._database, self._blobs, digests)
 

@@ -29,6 +29,14 @@ class VersionState(Enum):
     FAILED = "failed"
 
 
+class OperationMethod(Enum):
+    """Methods of the service that answer with an operation, by their names there."""
+
+    BUILD_MAP = "BuildMap"
+    IMPORT_MAP = "ImportMap"
+    IMPORT_EVENT_STREAM = "ImportEventStream"
+
+
 class OperationState(Enum):
     """Life of an operation."""
 
@@ -105,15 +113,21 @@ class MapVersionRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class OperationRecord:
-    """A build, from its request to its end.
+    """A long-running method, from its request to its end.
 
     Attributes:
-        error: what went wrong, as the caller of the store encoded it; empty unless FAILED.
+        request_sha256: hexadecimal digest of the request, but for its request id.
+        map_id, version, event_stream_id: what it works on; empty or 0 where there is no such thing.
+        metadata: what progress cannot say, as the caller of the store encoded it.
+        result: the answer in the same way; empty where rows tell it.
+        error: what went wrong in the same way; empty unless FAILED.
         update_seq: grows with every change.
-        end_time_us: 0 until it is final.
+        end_time_us, expire_time_us: 0 until it is final.
     """
 
     id: str
+    method: OperationMethod
+    request_sha256: str
     map_id: str
     version: int
     event_stream_id: str
@@ -122,10 +136,13 @@ class OperationRecord:
     done_count: int
     total_count: int
     fraction: float
+    metadata: bytes
+    result: bytes
     error: bytes
     update_seq: int
     create_time_us: int
     end_time_us: int
+    expire_time_us: int
 
 
 def now_us() -> int:
@@ -162,7 +179,8 @@ def map_version_from_row(row: RowMapping) -> MapVersionRecord:
 
 def operation_from_row(row: RowMapping) -> OperationRecord:
     """The inverse of `row_from_record`."""
-    return OperationRecord(**{**row, "state": OperationState(row["state"])})
+    states = {"state": OperationState(row["state"]), "method": OperationMethod(row["method"])}
+    return OperationRecord(**{**row, **states})
 
 
 def _stored(value: Any) -> Any:

@@ -7,6 +7,7 @@ from sqlalchemy import (
     Column,
     Float,
     ForeignKey,
+    Index,
     Integer,
     LargeBinary,
     MetaData,
@@ -86,7 +87,9 @@ OPERATION = Table(
     "operation",
     METADATA,
     Column("id", String, primary_key=True),
-    Column("map_id", ForeignKey("map.id", ondelete="CASCADE"), nullable=False),
+    Column("method", String, nullable=False),
+    Column("request_sha256", String, nullable=False),
+    Column("map_id", String, nullable=False),
     Column("version", BigInteger, nullable=False),
     Column("event_stream_id", String, nullable=False),
     Column("state", String, nullable=False),
@@ -94,8 +97,14 @@ OPERATION = Table(
     Column("done_count", BigInteger, nullable=False),
     Column("total_count", BigInteger, nullable=False),
     Column("fraction", Float, nullable=False),
+    Column("metadata", LargeBinary, nullable=False),
+    Column("result", LargeBinary, nullable=False),
     Column("error", LargeBinary, nullable=False),
     Column("update_seq", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
     Column("end_time_us", BigInteger, nullable=False),
+    Column("expire_time_us", BigInteger, nullable=False),
 )
+
+Index("operation_state", OPERATION.c.state)
+Index("operation_expire_time", OPERATION.c.expire_time_us)

@@ -10,12 +10,14 @@ from pathlib import Path
 
 from roel_service.errors import InputError, StateError
 from roel_service.store.blobs import BlobStore
-from roel_service.store.builds import Builds
+from roel_service.store.builds import Builds, VersionCompletion
 from roel_service.store.database import Database
 from roel_service.store.event_streams import EventStreams
 from roel_service.store.files import make_folder
 from roel_service.store.maps import Maps
+from roel_service.store.operations import Operations
 from roel_service.store.recordings import Recordings
+from roel_service.store.records import OperationMethod
 from roel_service.store.references import referenced
 
 
@@ -23,7 +25,7 @@ class Store:
     """What a server remembers; a context manager that holds the folder's lock.
 
     Attributes:
-        event_streams, maps, builds: the repositories.
+        event_streams, maps, builds, operations: the repositories.
 
     Raises:
         InputError: a folder that cannot be created or written.
@@ -41,7 +43,10 @@ class Store:
             self._recordings = Recordings(folder / "recordings")
             self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
             self.maps = Maps(self._database, self._blobs)
-            self.builds = Builds(self._database, self._blobs)
+            self.builds = Builds(self._database)
+            self.operations = Operations(
+                self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
+            )
             self._sweep()
             self._resources = resources.pop_all()
 

@@ -24,9 +24,11 @@ _sym_db = _symbol_database.Default()
 
 from google.api import field_behavior_pb2 as google_dot_api_dot_field__behavior__pb2
 from google.longrunning import operations_pb2 as google_dot_longrunning_dot_operations__pb2
+from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
+from google.rpc import status_pb2 as google_dot_rpc_dot_status__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n roel_service/v1/operations.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\"E\n\x15WatchOperationRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x18\n\nupdate_seq\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x01\"^\n\x16WatchOperationResponse\x12\x30\n\toperation\x18\x01 \x01(\x0b\x32\x1d.google.longrunning.Operation\x12\x12\n\nupdate_seq\x18\x02 \x01(\x03\x32w\n\x10OperationService\x12\x63\n\x0eWatchOperation\x12&.roel_service.v1.WatchOperationRequest\x1a\'.roel_service.v1.WatchOperationResponse0\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n roel_service/v1/operations.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x17google/rpc/status.proto\"E\n\x15WatchOperationRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x18\n\nupdate_seq\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x01\"^\n\x16WatchOperationResponse\x12\x30\n\toperation\x18\x01 \x01(\x0b\x32\x1d.google.longrunning.Operation\x12\x12\n\nupdate_seq\x18\x02 \x01(\x03\"\xf6\x03\n\x11OperationMetadata\x12\x0e\n\x06method\x18\x01 \x01(\t\x12\x0e\n\x06target\x18\x02 \x01(\t\x12\r\n\x05stage\x18\x03 \x01(\t\x12\x12\n\ndone_count\x18\x04 \x01(\x03\x12\x13\n\x0btotal_count\x18\x05 \x01(\x03\x12\x10\n\x08\x66raction\x18\x06 \x01(\x01\x12\x12\n\nupdate_seq\x18\x07 \x01(\x03\x12/\n\x0b\x63reate_time\x18\x08 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12,\n\x08\x65nd_time\x18\t \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12/\n\x0b\x65xpire_time\x18\n \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12.\n\x06stages\x18\x0b \x03(\x0b\x32\x1e.roel_service.v1.StageProgress\x12\x18\n\x0btime_left_s\x18\x0c \x01(\x01H\x00\x88\x01\x01\x12\x15\n\rattempt_count\x18\r \x01(\x05\x12$\n\x08warnings\x18\x0e \x03(\x0b\x32\x12.google.rpc.Status\x12\x17\n\x0fpreview_version\x18\x0f \x01(\t\x12\r\n\x05\x63pu_s\x18\x10 \x01(\x01\x12\x14\n\x0cpeak_rss_mib\x18\x11 \x01(\x01\x42\x0e\n\x0c_time_left_s\"\\\n\rStageProgress\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x12\n\ndone_count\x18\x02 \x01(\x03\x12\x13\n\x0btotal_count\x18\x03 \x01(\x03\x12\x14\n\x0c\x63\x61\x63hed_count\x18\x04 \x01(\x03\x32w\n\x10OperationService\x12\x63\n\x0eWatchOperation\x12&.roel_service.v1.WatchOperationRequest\x1a\'.roel_service.v1.WatchOperationResponse0\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -37,10 +39,14 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_WATCHOPERATIONREQUEST'].fields_by_name['name']._serialized_options = b'\342A\001\002'
   _globals['_WATCHOPERATIONREQUEST'].fields_by_name['update_seq']._loaded_options = None
   _globals['_WATCHOPERATIONREQUEST'].fields_by_name['update_seq']._serialized_options = b'\342A\001\001'
-  _globals['_WATCHOPERATIONREQUEST']._serialized_start=123
-  _globals['_WATCHOPERATIONREQUEST']._serialized_end=192
-  _globals['_WATCHOPERATIONRESPONSE']._serialized_start=194
-  _globals['_WATCHOPERATIONRESPONSE']._serialized_end=288
-  _globals['_OPERATIONSERVICE']._serialized_start=290
-  _globals['_OPERATIONSERVICE']._serialized_end=409
+  _globals['_WATCHOPERATIONREQUEST']._serialized_start=181
+  _globals['_WATCHOPERATIONREQUEST']._serialized_end=250
+  _globals['_WATCHOPERATIONRESPONSE']._serialized_start=252
+  _globals['_WATCHOPERATIONRESPONSE']._serialized_end=346
+  _globals['_OPERATIONMETADATA']._serialized_start=349
+  _globals['_OPERATIONMETADATA']._serialized_end=851
+  _globals['_STAGEPROGRESS']._serialized_start=853
+  _globals['_STAGEPROGRESS']._serialized_end=945
+  _globals['_OPERATIONSERVICE']._serialized_start=947
+  _globals['_OPERATIONSERVICE']._serialized_end=1066
 # @@protoc_insertion_point(module_scope)

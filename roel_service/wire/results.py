@@ -6,7 +6,7 @@ from typing import Any
 
 from roel_service.progress import Progress
 from roel_service.scene.results import MAPPING_STAGES
-from roel_service.v1 import maps_pb2
+from roel_service.v1 import maps_pb2, operations_pb2
 from roel_service.wire.configs import tables_from_proto, tables_to_proto
 
 Report = dict[str, Any]
@@ -38,8 +38,8 @@ def report_from_proto(message: maps_pb2.BuildReport) -> Report:
     }
 
 
-def progress_from_proto(message: maps_pb2.BuildMapMetadata) -> Progress:
-    """How far a build is."""
+def progress_from_proto(message: operations_pb2.OperationMetadata) -> Progress:
+    """How far an operation is."""
     return Progress(
         stage=message.stage,
         done_count=message.done_count,

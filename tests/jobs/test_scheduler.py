@@ -40,7 +40,7 @@ async def reach(scheduler, store, operation, wanted):
     """The record once `wanted` holds for it."""
     while True:
         changed = scheduler.changes.next()
-        record = store.builds.get(operation.id)
+        record = store.operations.get(operation.id)
         if wanted(record):
             return record
         await asyncio.wait_for(changed.wait(), 30)
@@ -60,7 +60,7 @@ def error_of(record):
 
 def test_a_build_that_works_makes_its_version_active(store):
     async def scenario():
-        scheduler = Scheduler(store.builds, 1, 1)
+        scheduler = Scheduler(store.operations, 1, 1)
         operation = await scheduler.submit(begin(store, "build_nothing"))
         return await ended(scheduler, store, operation)
 
@@ -76,7 +76,7 @@ def test_a_build_that_works_makes_its_version_active(store):
 )
 def test_a_build_that_fails_says_why(store, task, reason):
     async def scenario():
-        scheduler = Scheduler(store.builds, 1, 1)
+        scheduler = Scheduler(store.operations, 1, 1)
         operation = await scheduler.submit(begin(store, task, "walk"))
         return await ended(scheduler, store, operation)
 
@@ -88,7 +88,7 @@ def test_a_build_that_fails_says_why(store, task, reason):
 
 def test_a_result_that_is_no_map_is_a_logged_fault(store, caplog):
     async def scenario():
-        scheduler = Scheduler(store.builds, 1, 1)
+        scheduler = Scheduler(store.operations, 1, 1)
         operation = await scheduler.submit(begin(store, "double", 21))
         return await ended(scheduler, store, operation)
 
@@ -101,14 +101,14 @@ def test_a_result_that_is_no_map_is_a_logged_fault(store, caplog):
 
 def test_the_queue_is_bounded_and_waits_its_turn(store):
     async def scenario():
-        scheduler = Scheduler(store.builds, concurrent_count=1, queued_count=1)
+        scheduler = Scheduler(store.operations, concurrent_count=1, queued_count=1)
         first = await scheduler.submit(begin(store, "sleep"))
         await at_work(scheduler, store, first)
         second = await scheduler.submit(begin(store, "build_nothing"))
         with pytest.raises(LimitError) as caught:
             await scheduler.submit(begin(store, "build_nothing"))
         assert caught.value.reason == "QUEUE_FULL"
-        assert store.builds.get(second.id).state is OperationState.QUEUED
+        assert store.operations.get(second.id).state is OperationState.QUEUED
         await scheduler.cancel(first.id)
         record = await ended(scheduler, store, second)
         third = await scheduler.submit(begin(store, "build_nothing"))
@@ -121,13 +121,13 @@ def test_the_queue_is_bounded_and_waits_its_turn(store):
 @pytest.mark.parametrize("is_queued", [False, True])
 def test_a_cancelled_build_is_cancelled_when_cancel_returns(store, is_queued):
     async def scenario():
-        scheduler = Scheduler(store.builds, concurrent_count=1, queued_count=1)
+        scheduler = Scheduler(store.operations, concurrent_count=1, queued_count=1)
         first = await scheduler.submit(begin(store, "sleep"))
         await at_work(scheduler, store, first)
         second = await scheduler.submit(begin(store, "sleep"))
         chosen = second if is_queued else first
         await scheduler.cancel(chosen.id)
-        record = store.builds.get(chosen.id)
+        record = store.operations.get(chosen.id)
         await scheduler.cancel(chosen.id)
         await scheduler.drain()
         return record
@@ -137,20 +137,20 @@ def test_a_cancelled_build_is_cancelled_when_cancel_returns(store, is_queued):
 
 def test_a_draining_scheduler_fails_its_builds_and_takes_no_more(store):
     async def scenario():
-        scheduler = Scheduler(store.builds, 1, 1)
+        scheduler = Scheduler(store.operations, 1, 1)
         operation = await scheduler.submit(begin(store, "sleep"))
         await scheduler.drain()
         with pytest.raises(UnavailableError) as caught:
             await scheduler.submit(begin(store, "sleep"))
         assert caught.value.reason == "DRAINING"
-        return store.builds.get(operation.id)
+        return store.operations.get(operation.id)
 
     assert error_of(asyncio.run(scenario())).reason == "DRAINING"
 
 
 def test_a_build_that_cannot_begin_leaves_its_place_free(store):
     async def scenario():
-        scheduler = Scheduler(store.builds, concurrent_count=1, queued_count=0)
+        scheduler = Scheduler(store.operations, concurrent_count=1, queued_count=0)
 
         def missing():
             store.builds.begin("elsewhere", "walk")
@@ -165,7 +165,7 @@ def test_a_build_that_cannot_begin_leaves_its_place_free(store):
 
 def test_what_a_dead_server_left_behind_fails_as_lost(store):
     queued = store.builds.begin("house", "walk")
-    asyncio.run(Scheduler(store.builds, 1, 1).fail_unfinished())
-    record = store.builds.get(queued.id)
+    asyncio.run(Scheduler(store.operations, 1, 1).fail_unfinished())
+    record = store.operations.get(queued.id)
     assert record.state is OperationState.FAILED
     assert error_of(record).reason == "WORKER_LOST"

@@ -84,7 +84,7 @@ def watch(connection):
 
 
 def metadata_of(message):
-    metadata = maps_pb2.BuildMapMetadata()
+    metadata = roel_operations_pb2.OperationMetadata()
     assert message.metadata.Unpack(metadata)
     return metadata
 
@@ -106,7 +106,7 @@ def test_an_ended_operation_answers_with_its_version(ended, call):
         assert message.response.Unpack(answered)
         assert answered == version
     metadata = metadata_of(message)
-    assert (metadata.map_version, metadata.fraction) == (version.name, 1.0)
+    assert (metadata.target, metadata.method) == (version.name, "BuildMap")
     assert metadata.end_time.ToMicroseconds() >= metadata.create_time.ToMicroseconds()
 
 

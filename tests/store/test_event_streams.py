@@ -174,7 +174,7 @@ def test_a_recording_that_a_build_reads_stays(store):
     with pytest.raises(StateError) as caught:
         store.event_streams.delete("walk")
     assert caught.value.reason == "STREAM_IN_USE"
-    store.builds.cancel(operation.id)
+    store.operations.cancel(operation.id)
     store.event_streams.delete("walk")
 
 

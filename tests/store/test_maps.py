@@ -21,7 +21,7 @@ def maps(store):
 def built(store, data=b"map file"):
     operation = store.builds.begin("house", "walk")
     version = BuiltVersion(rlm_bytes=data, line_count=4, bounds_m=BUILT.bounds_m, report={})
-    store.builds.succeed(operation.id, version)
+    store.operations.succeed(operation.id, version)
     return store.maps.version("house", operation.version)
 
 
@@ -40,7 +40,7 @@ def test_an_id_in_use_is_refused(maps):
 def test_versions_are_numbered_and_latest_is_the_newest_active_one(store, maps):
     built(store)
     built(store)
-    store.builds.cancel(store.builds.begin("house", "walk").id)
+    store.operations.cancel(store.builds.begin("house", "walk").id)
     assert maps.get("house").version_count == 3
     assert maps.version("house", None).version == 2
     assert [item.version for item in maps.version_page("house", 0, 10)] == [1, 2, 3]
@@ -79,7 +79,7 @@ def test_a_deleted_map_takes_its_versions_operations_and_blobs_along(store, maps
     with pytest.raises(NotFoundError):
         maps.version("house", 1)
     with pytest.raises(NotFoundError):
-        store.builds.get(record.operation_id)
+        store.operations.get(record.operation_id)
     assert not list((folder / "blobs").rglob(record.sha256))
 
 

@@ -1,6 +1,6 @@
 from sqlalchemy import MetaData, create_engine
 
-from roel_service.store.migrations import migrate
+from roel_service.store.migrations import m001_first_tables, migrate
 from roel_service.store.schema import METADATA
 
 
@@ -32,3 +32,26 @@ def test_migrating_twice_changes_nothing():
         migrated = MetaData()
         migrated.reflect(connection)
         assert set(migrated.tables) == set(METADATA.tables)
+
+
+def test_operations_of_the_first_release_become_builds():
+    engine = create_engine("sqlite://")
+    with engine.begin() as connection:
+        m001_first_tables.migrate(connection)
+        connection.exec_driver_sql("PRAGMA user_version = 1")
+        connection.exec_driver_sql("INSERT INTO map VALUES ('house', 2, 0)")
+        for row in (
+            "'ended', 'house', 1, 'walk', 'failed'",
+            "'begun', 'house', 2, 'walk', 'queued'",
+        ):
+            end_time_us = 7 if "ended" in row else 0
+            connection.exec_driver_sql(
+                f"INSERT INTO operation VALUES ({row}, '', 0, 0, 0, x'65', 3, 5, {end_time_us})"
+            )
+        migrate(connection)
+        columns = "id, method, version, error, expire_time_us"
+        rows = connection.exec_driver_sql(f"SELECT {columns} FROM operation ORDER BY version")
+        assert [tuple(row) for row in rows] == [
+            ("ended", "BuildMap", 1, b"e", 7 + 30 * 24 * 3600 * 1_000_000),
+            ("begun", "BuildMap", 2, b"e", 0),
+        ]

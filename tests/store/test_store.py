@@ -17,7 +17,7 @@ def test_everything_is_there_after_opening_again(folder):
     with Store(folder) as store:
         assert store.event_streams.get("walk") == stream
         assert store.event_streams.event_file(stream).read_bytes() == b"events"
-        assert store.builds.unfinished() == [operation]
+        assert store.operations.unfinished() == [operation]
 
 
 def test_a_folder_belongs_to_one_process_at_a_time(store, folder):

@@ -4,7 +4,7 @@ from roel_service.config.load import to_tables
 from roel_service.config.presets import PRESETS, preset
 from roel_service.progress import Progress
 from roel_service.scene.results import MAPPING_STAGES
-from roel_service.v1 import maps_pb2
+from roel_service.v1 import operations_pb2
 from roel_service.wire.results import progress_from_proto, report_from_proto, report_to_proto
 
 
@@ -29,6 +29,8 @@ def test_reports_print_the_same_json_on_both_sides():
 
 
 def test_progress_is_what_the_metadata_says():
-    message = maps_pb2.BuildMapMetadata(stage="refine", done_count=2, total_count=8, fraction=0.5)
+    message = operations_pb2.OperationMetadata(
+        stage="refine", done_count=2, total_count=8, fraction=0.5
+    )
     expected = Progress(stage="refine", done_count=2, total_count=8, fraction=0.5)
     assert progress_from_proto(message) == expected

@@ -10,10 +10,13 @@ from collections.abc import Callable
 from sqlalchemy import Connection, text
 
 from roel_service.errors import StateError
-from roel_service.store.migrations import m001_first_tables
+from roel_service.store.migrations import m001_first_tables, m002_methods_of_operations
 
 # Step k leads from version k to k + 1.
-MIGRATIONS: tuple[Callable[[Connection], None], ...] = (m001_first_tables.migrate,)
+MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
+    m001_first_tables.migrate,
+    m002_methods_of_operations.migrate,
+)
 
 
 def migrate(connection: Connection) -> None:
