@@ -29,8 +29,9 @@ format: $(INSTALLED)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-proto: $(INSTALLED)  ## write the committed stubs of proto/ anew
+proto: $(INSTALLED)  ## write the committed stubs of proto/, and the client made from aio.py, anew
 	$(BIN)/python proto/generate.py
+	$(BIN)/python clients/generate.py
 
 bench: $(INSTALLED)  ## measure the maps; SUITE=full takes hours, needs ROEL_DATA and `make limap`
 	$(BIN)/roel bench mapping --suite $(or $(SUITE),quick) --out $(or $(OUT),bench-out)
@@ -51,6 +52,7 @@ stubs-are-current: $(INSTALLED)  ## the committed stubs are what proto/ generate
 	$(BIN)/python proto/generate.py --root build/generated
 	diff -r -x __pycache__ build/generated/proto proto
 	diff -r -x __pycache__ build/generated/roel_service/v1 roel_service/v1
+	$(BIN)/python clients/generate.py --check
 	cp buf.yaml build/generated && cd build/generated && $(CURDIR)/$(BIN)/buf lint
 
 # Without their dependencies: both demand a second OpenCV wheel, which would overwrite cv2 and remove

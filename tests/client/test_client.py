@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from roel_client import Client
-from roel_client.connection import Connection
+from roel_client.connection import Connection, Endpoint
 from roel_service.config.load import to_tables
 from roel_service.errors import (
     Cancelled,
@@ -34,7 +34,7 @@ def map_with(client, seed, progress=ignore, events=None):
 @pytest.fixture
 def kept(server):
     """Names of all that the server keeps."""
-    connection = Connection(server.address)
+    connection = Connection(Endpoint(address=server.address))
     streams = events_pb2_grpc.EventStreamServiceStub(connection.channel)
     maps = maps_pb2_grpc.MapServiceStub(connection.channel)
 

@@ -1,7 +1,7 @@
 import pytest
 
 from roel_client import Client
-from roel_client.connection import Connection
+from roel_client.connection import Connection, Endpoint
 
 from .processes import Server, servers
 
@@ -29,7 +29,7 @@ def client(server):
 @pytest.fixture(scope="module")
 def connection(server):
     """For calls that the client does not make."""
-    opened = Connection(server.address)
+    opened = Connection(Endpoint(address=server.address))
     yield opened
     opened.close()
 

@@ -16,7 +16,7 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
 )
 
 from roel_client import Client
-from roel_client.connection import Connection
+from roel_client.connection import Connection, Endpoint
 from roel_service import __version__
 from roel_service.errors import InputError, RoelError, UnavailableError
 from roel_service.scene.results import MAPPING_STAGES
@@ -147,7 +147,7 @@ def test_committed_chunks_survive_a_killed_server(start_server):
             yield events_pb2.AppendEventsRequest(chunk=chunk)
 
     def upload(stream):
-        connection = Connection(first.address)
+        connection = Connection(Endpoint(address=first.address))
         stub = events_pb2_grpc.EventStreamServiceStub(connection.channel)
         with pytest.raises(UnavailableError):
             connection.upload(stub.AppendEvents, requests(stream))

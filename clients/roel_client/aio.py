@@ -1,0 +1,324 @@
+"""The asynchronous client: recordings up, maps down.
+
+`client.py`, the client for code without an event loop, is generated from this file by
+`clients/generate.py`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from typing import TypeVar
+
+from google.longrunning import operations_pb2, operations_pb2_grpc
+
+from roel_client.connection import AsyncConnection, Endpoint, Tls
+from roel_client.retry import RESUMING, Attempts, RetryPolicy
+from roel_service.config.stages import Config
+from roel_service.errors import CorruptionError, RoelError
+from roel_service.progress import Progress, ProgressCallback, ignore
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventSource
+from roel_service.scene.trajectory import Trajectory
+from roel_service.v1 import (
+    capabilities_pb2,
+    capabilities_pb2_grpc,
+    events_pb2,
+    events_pb2_grpc,
+    maps_pb2,
+    maps_pb2_grpc,
+    types_pb2,
+)
+from roel_service.v1 import operations_pb2 as roel_operations_pb2
+from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
+from roel_service.wire import names
+from roel_service.wire.chunks import encode_chunk, split_chunks
+from roel_service.wire.configs import config_to_proto
+from roel_service.wire.errors import error_from_status
+from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
+from roel_service.wire.results import Report, progress_from_proto, report_from_proto
+
+Result = TypeVar("Result")
+
+# Sealing a recording reads it once.
+FINALIZE_TIMEOUT_S = 300.0
+
+DEFAULT_RETRY = RetryPolicy()
+
+# About 0.8 MiB a message.
+POSES_PER_MESSAGE = 8192
+
+
+class AsyncClient:
+    """One server; a context manager.
+
+    Every method raises the `RoelError` that the server raised, and `UnavailableError` when there
+    is no server. Single calls are repeated where that is safe, uploads and watches go on where they
+    broke. Requests that change something carry an id made once for all attempts of a call.
+
+    Args:
+        address: `HOST:PORT`, or `unix:PATH`.
+        token: says who calls, to a server that asks.
+        tls: how the connection is encrypted; None speaks in plain text.
+        timeout_s: so long a single call may take, with all its attempts.
+        retry: how single calls are repeated.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        *,
+        token: str | None = None,
+        tls: Tls | None = None,
+        timeout_s: float = 10.0,
+        retry: RetryPolicy = DEFAULT_RETRY,
+    ) -> None:
+        endpoint = Endpoint(address=address, token=token, tls=tls, timeout_s=timeout_s, retry=retry)
+        self._connection = AsyncConnection(endpoint)
+        channel = self._connection.channel
+        self._capabilities = capabilities_pb2_grpc.CapabilitiesServiceStub(channel)
+        self._streams = events_pb2_grpc.EventStreamServiceStub(channel)
+        self._maps = maps_pb2_grpc.MapServiceStub(channel)
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *error: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End the connection."""
+        await self._connection.close()
+
+    async def capabilities(self) -> capabilities_pb2.Capabilities:
+        """Version, limits, presets and stages of the server."""
+        request = capabilities_pb2.GetCapabilitiesRequest()
+        return await self._connection.call(self._capabilities.GetCapabilities, request)
+
+    async def map_recording(
+        self,
+        events: EventSource,
+        trajectory: Trajectory,
+        camera: Camera,
+        config: Config,
+        progress: ProgressCallback = ignore,
+    ) -> tuple[bytes, Report]:
+        """Let the server build a map as `build_map` would in process; nothing stays there.
+
+        Returns:
+            The bytes of the map file, and the report.
+        """
+        async with self._temporary_stream(camera) as stream, self._temporary_map() as map_name:
+            await self.upload_poses(stream, trajectory)
+            await self.upload_events(stream, events, progress)
+            await self.finalize(stream)
+            operation = await self.build_map(map_name, stream, config)
+            version = await operation.wait(progress)
+            return await self.download_map(version.name), report_from_proto(version.report)
+
+    async def create_event_stream(self, stream_id: str, camera: Camera) -> str:
+        """Open a recording; its name."""
+        request = events_pb2.CreateEventStreamRequest(
+            parent=names.PROJECT,
+            event_stream_id=stream_id,
+            event_stream=events_pb2.EventStream(camera=camera_to_proto(camera)),
+        )
+        created = await self._connection.call(self._streams.CreateEventStream, request)
+        return str(created.name)
+
+    async def upload_events(
+        self, stream: str, source: EventSource, progress: ProgressCallback = ignore
+    ) -> events_pb2.EventStream:
+        """Append a whole source; a broken upload is taken up where the server's record ends."""
+        return await _resumed(lambda: self._append_events(stream, source, progress))
+
+    async def upload_poses(self, stream: str, trajectory: Trajectory) -> events_pb2.EventStream:
+        """Append poses."""
+        requests = _pose_requests(stream, trajectory)
+        return await self._connection.upload(self._streams.AppendPoses, requests)
+
+    async def finalize(self, stream: str) -> events_pb2.EventStream:
+        """Freeze a recording."""
+        request = events_pb2.FinalizeEventStreamRequest(name=stream)
+        method = self._streams.FinalizeEventStream
+        return await self._connection.call(method, request, timeout_s=FINALIZE_TIMEOUT_S)
+
+    async def event_stream(self, name: str) -> events_pb2.EventStream:
+        """What the server has of a recording."""
+        request = events_pb2.GetEventStreamRequest(name=name)
+        return await self._connection.call(self._streams.GetEventStream, request)
+
+    async def delete_event_stream(self, name: str) -> None:
+        """Delete a recording."""
+        request = events_pb2.DeleteEventStreamRequest(name=name)
+        await self._connection.call(self._streams.DeleteEventStream, request)
+
+    async def create_map(self, map_id: str) -> str:
+        """Name a map; its resource name."""
+        request = maps_pb2.CreateMapRequest(parent=names.PROJECT, map_id=map_id)
+        created = await self._connection.call(self._maps.CreateMap, request)
+        return str(created.name)
+
+    async def build_map(self, map_name: str, stream: str, config: Config) -> AsyncOperation:
+        """Begin to build a new version of a map from a frozen recording."""
+        request = maps_pb2.BuildMapRequest(
+            parent=map_name, event_stream=stream, config=config_to_proto(config)
+        )
+        begun = await self._connection.call(self._maps.BuildMap, request)
+        return self.operation(begun.name)
+
+    def operation(self, name: str) -> AsyncOperation:
+        """A build that was begun before, perhaps by somebody else."""
+        return AsyncOperation(self._connection, name)
+
+    async def map_version(self, name: str) -> maps_pb2.MapVersion:
+        """One version of a map; its last part may be `latest`."""
+        request = maps_pb2.GetMapVersionRequest(name=name)
+        return await self._connection.call(self._maps.GetMapVersion, request)
+
+    async def download_map(self, name: str) -> bytes:
+        """The map file of a version; raises `CorruptionError` unless it is what was built."""
+        version = await self.map_version(name)
+        request = maps_pb2.DownloadMapRequest(name=version.name)
+        parts = self._connection.stream(self._maps.DownloadMap, request)
+        data = b"".join([part.data async for part in parts])
+        found = hashlib.sha256(data).hexdigest()
+        if found != version.map.sha256:
+            raise CorruptionError(version.name, f"bytes of digest {version.map.sha256}", found)
+        return data
+
+    async def delete_map(self, name: str) -> None:
+        """Delete a map with all its versions."""
+        await self._connection.call(self._maps.DeleteMap, maps_pb2.DeleteMapRequest(name=name))
+
+    async def _append_events(
+        self, stream: str, source: EventSource, progress: ProgressCallback
+    ) -> events_pb2.EventStream:
+        record = await self.event_stream(stream)
+        requests = _event_requests(stream, source, record.chunk_count, progress)
+        return await self._connection.upload(self._streams.AppendEvents, requests)
+
+    @contextlib.asynccontextmanager
+    async def _temporary_stream(self, camera: Camera) -> AsyncIterator[str]:
+        name = await self.create_event_stream(_temporary_id(), camera)
+        try:
+            yield name
+        finally:
+            with contextlib.suppress(RoelError):
+                await self.delete_event_stream(name)
+
+    @contextlib.asynccontextmanager
+    async def _temporary_map(self) -> AsyncIterator[str]:
+        name = await self.create_map(_temporary_id())
+        try:
+            yield name
+        finally:
+            with contextlib.suppress(RoelError):
+                await self.delete_map(name)
+
+
+class AsyncOperation:
+    """A build on a server.
+
+    Attributes:
+        name: `operations/{uuid}`.
+    """
+
+    def __init__(self, connection: AsyncConnection, name: str) -> None:
+        self.name = name
+        self._connection = connection
+        self._operations = operations_pb2_grpc.OperationsStub(connection.channel)
+        self._watching = roel_operations_pb2_grpc.OperationServiceStub(connection.channel)
+        self._update_seq = 0
+
+    async def wait(self, progress: ProgressCallback = ignore) -> maps_pb2.MapVersion:
+        """The version that was built; whatever interrupts the waiting cancels the build.
+
+        Raises:
+            RoelError: why the build failed.
+            Cancelled: it was cancelled.
+        """
+        try:
+            operation = await _resumed(lambda: self._watch(progress))
+        except BaseException:
+            with contextlib.suppress(RoelError):
+                await self.cancel()
+            raise
+        if operation.HasField("error"):
+            raise error_from_status(operation.error)
+        version = maps_pb2.MapVersion()
+        operation.response.Unpack(version)
+        return version
+
+    async def cancel(self) -> None:
+        """End the build; returns when it has ended."""
+        request = operations_pb2.CancelOperationRequest(name=self.name)
+        await self._connection.call(self._operations.CancelOperation, request)
+
+    async def _watch(self, progress: ProgressCallback) -> operations_pb2.Operation:
+        """Tell every change from the last one seen; the operation when it is done."""
+        request = roel_operations_pb2.WatchOperationRequest(
+            name=self.name, update_seq=self._update_seq
+        )
+        answers = self._connection.stream(self._watching.WatchOperation, request)
+        async with contextlib.aclosing(answers):
+            async for answer in answers:
+                self._update_seq = answer.update_seq
+                if answer.operation.done:
+                    return answer.operation
+                metadata = maps_pb2.BuildMapMetadata()
+                answer.operation.metadata.Unpack(metadata)
+                progress(progress_from_proto(metadata))
+        raise RoelError(self.name, "an operation that ends", "a watch that ended before it")
+
+
+def _event_requests(
+    stream: str, source: EventSource, first_seq: int, progress: ProgressCallback
+) -> Iterator[events_pb2.AppendEventsRequest]:
+    yield events_pb2.AppendEventsRequest(event_stream=stream)
+    event_count = 0
+    for seq, events in enumerate(split_chunks(source)):
+        event_count += len(events)
+        if seq >= first_seq:
+            chunk = events_pb2.EventChunk(seq=seq, data=encode_chunk(events))
+            yield events_pb2.AppendEventsRequest(chunk=chunk)
+        told = Progress(stage="upload", done_count=event_count, total_count=0, fraction=0.0)
+        progress(told)
+
+
+def _pose_requests(stream: str, trajectory: Trajectory) -> Iterator[events_pb2.AppendPosesRequest]:
+    yield events_pb2.AppendPosesRequest(event_stream=stream)
+    columns = trajectory_to_proto(trajectory)
+    for start in range(0, len(trajectory), POSES_PER_MESSAGE):
+        yield events_pb2.AppendPosesRequest(poses=_pose_part(columns, start))
+
+
+def _pose_part(columns: types_pb2.Trajectory, start: int) -> types_pb2.Trajectory:
+    """Rows start to start + `POSES_PER_MESSAGE` of every column."""
+    rows = slice(start, start + POSES_PER_MESSAGE)
+    return types_pb2.Trajectory(
+        t_us=columns.t_us[rows.start * 8 : rows.stop * 8],
+        translation_m=columns.translation_m[rows.start * 24 : rows.stop * 24],
+        rotation=columns.rotation[rows.start * 72 : rows.stop * 72],
+    )
+
+
+async def _resumed(call: Callable[[], Awaitable[Result]]) -> Result:
+    """Result of a call that continues where it broke.
+
+    Raises:
+        UnavailableError: the server stayed unavailable.
+    """
+    attempts = Attempts(RESUMING)
+    while True:
+        try:
+            return await call()
+        except RoelError as error:
+            await asyncio.sleep(attempts.pause_s(error))
+
+
+def _temporary_id() -> str:
+    return f"temporary-{uuid.uuid4().hex[:16]}"
