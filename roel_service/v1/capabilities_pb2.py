@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/capabilities.proto\x12\x0froel_service.v1\"\x18\n\x16GetCapabilitiesRequest\"i\n\x0c\x43\x61pabilities\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\'\n\x06limits\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.Limits\x12\x0f\n\x07presets\x18\x03 \x03(\t\x12\x0e\n\x06stages\x18\x04 \x03(\t\"\xb9\x01\n\x06Limits\x12\x18\n\x10message_in_bytes\x18\x01 \x01(\x03\x12\x19\n\x11message_out_bytes\x18\x02 \x01(\x03\x12\x18\n\x10\x65vents_per_chunk\x18\x03 \x01(\x03\x12\x1a\n\x12\x65vent_stream_bytes\x18\x04 \x01(\x03\x12\x12\n\npose_count\x18\x05 \x01(\x03\x12\x19\n\x11\x63oncurrent_builds\x18\x06 \x01(\x03\x12\x15\n\rqueued_builds\x18\x07 \x01(\x03\x32p\n\x13\x43\x61pabilitiesService\x12Y\n\x0fGetCapabilities\x12\'.roel_service.v1.GetCapabilitiesRequest\x1a\x1d.roel_service.v1.Capabilitiesb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/capabilities.proto\x12\x0froel_service.v1\"\x18\n\x16GetCapabilitiesRequest\"\xb3\x02\n\x0c\x43\x61pabilities\x12\x0f\n\x07version\x18\x01 \x01(\t\x12\'\n\x06limits\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.Limits\x12\x0f\n\x07presets\x18\x03 \x03(\t\x12\x0e\n\x06stages\x18\x04 \x03(\t\x12\x16\n\x0e\x63hunk_versions\x18\x05 \x03(\x05\x12\x17\n\x0f\x63hunk_encodings\x18\x06 \x03(\t\x12\x18\n\x10map_file_version\x18\x07 \x01(\t\x12\x16\n\x0eimport_formats\x18\x08 \x03(\t\x12\x16\n\x0e\x65xport_formats\x18\t \x03(\t\x12\x11\n\tdetectors\x18\n \x03(\t\x12\x10\n\x08matchers\x18\x0b \x03(\t\x12(\n\x07methods\x18\x0c \x03(\x0b\x32\x17.roel_service.v1.Method\"+\n\x06Method\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x13\n\x0bimplemented\x18\x02 \x01(\x08\"\xaf\x04\n\x06Limits\x12\x18\n\x10message_in_bytes\x18\x01 \x01(\x03\x12\x19\n\x11message_out_bytes\x18\x02 \x01(\x03\x12\x18\n\x10\x65vents_per_chunk\x18\x03 \x01(\x03\x12\x1a\n\x12\x65vent_stream_bytes\x18\x04 \x01(\x03\x12\x12\n\npose_count\x18\x05 \x01(\x03\x12\x19\n\x11\x63oncurrent_builds\x18\x06 \x01(\x03\x12\x15\n\rqueued_builds\x18\x07 \x01(\x03\x12\x11\n\tpage_size\x18\x08 \x01(\x03\x12\x12\n\nline_count\x18\t \x01(\x03\x12\x19\n\x11lines_per_message\x18\n \x01(\x03\x12\x13\n\x0blabel_count\x18\x0b \x01(\x03\x12\x1b\n\x13\x64isplay_name_length\x18\x0c \x01(\x03\x12\x13\n\x0b\x61lias_count\x18\r \x01(\x03\x12\x19\n\x11maps_per_localize\x18\x0e \x01(\x03\x12\x18\n\x10hypothesis_count\x18\x0f \x01(\x03\x12\x1a\n\x12inline_point_count\x18\x10 \x01(\x03\x12\x1a\n\x12inline_image_bytes\x18\x11 \x01(\x03\x12\x18\n\x10\x62\x61tch_item_count\x18\x12 \x01(\x03\x12 \n\x18operation_retention_days\x18\x13 \x01(\x03\x12\x1e\n\x16request_retention_days\x18\x14 \x01(\x03\x12\"\n\x1a\x64\x65leted_map_retention_days\x18\x15 \x01(\x03\x32p\n\x13\x43\x61pabilitiesService\x12Y\n\x0fGetCapabilities\x12\'.roel_service.v1.GetCapabilitiesRequest\x1a\x1d.roel_service.v1.Capabilitiesb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,10 +33,12 @@ if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_GETCAPABILITIESREQUEST']._serialized_start=55
   _globals['_GETCAPABILITIESREQUEST']._serialized_end=79
-  _globals['_CAPABILITIES']._serialized_start=81
-  _globals['_CAPABILITIES']._serialized_end=186
-  _globals['_LIMITS']._serialized_start=189
-  _globals['_LIMITS']._serialized_end=374
-  _globals['_CAPABILITIESSERVICE']._serialized_start=376
-  _globals['_CAPABILITIESSERVICE']._serialized_end=488
+  _globals['_CAPABILITIES']._serialized_start=82
+  _globals['_CAPABILITIES']._serialized_end=389
+  _globals['_METHOD']._serialized_start=391
+  _globals['_METHOD']._serialized_end=434
+  _globals['_LIMITS']._serialized_start=437
+  _globals['_LIMITS']._serialized_end=996
+  _globals['_CAPABILITIESSERVICE']._serialized_start=998
+  _globals['_CAPABILITIESSERVICE']._serialized_end=1110
 # @@protoc_insertion_point(module_scope)

@@ -4,7 +4,6 @@ import grpc
 import warnings
 
 from google.longrunning import operations_pb2 as google_dot_longrunning_dot_operations__pb2
-from google.protobuf import empty_pb2 as google_dot_protobuf_dot_empty__pb2
 from roel_service.v1 import maps_pb2 as roel__service_dot_v1_dot_maps__pb2
 
 GRPC_GENERATED_VERSION = '1.85.1'
@@ -28,7 +27,8 @@ if _version_not_supported:
 
 
 class MapServiceStub:
-    """Maps of 3D line segments. A map is a name; its versions are immutable.
+    """Maps of 3D line segments. A map is a name; its versions are immutable. Wherever a version is
+    named, an alias may stand in the place of its number, and the answer names the version used.
     """
 
     def __init__(self, channel):
@@ -52,14 +52,34 @@ class MapServiceStub:
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.ListMapsRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_maps__pb2.ListMapsResponse.FromString,
                 _registered_method=True)
+        self.UpdateMap = channel.unary_unary(
+                '/roel_service.v1.MapService/UpdateMap',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.UpdateMapRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+                _registered_method=True)
         self.DeleteMap = channel.unary_unary(
                 '/roel_service.v1.MapService/DeleteMap',
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapRequest.SerializeToString,
-                response_deserializer=google_dot_protobuf_dot_empty__pb2.Empty.FromString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+                _registered_method=True)
+        self.UndeleteMap = channel.unary_unary(
+                '/roel_service.v1.MapService/UndeleteMap',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.UndeleteMapRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.Map.FromString,
                 _registered_method=True)
         self.BuildMap = channel.unary_unary(
                 '/roel_service.v1.MapService/BuildMap',
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.BuildMapRequest.SerializeToString,
+                response_deserializer=google_dot_longrunning_dot_operations__pb2.Operation.FromString,
+                _registered_method=True)
+        self.RefinePoses = channel.unary_unary(
+                '/roel_service.v1.MapService/RefinePoses',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.RefinePosesRequest.SerializeToString,
+                response_deserializer=google_dot_longrunning_dot_operations__pb2.Operation.FromString,
+                _registered_method=True)
+        self.ImportMap = channel.unary_unary(
+                '/roel_service.v1.MapService/ImportMap',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.ImportMapRequest.SerializeToString,
                 response_deserializer=google_dot_longrunning_dot_operations__pb2.Operation.FromString,
                 _registered_method=True)
         self.GetMapVersion = channel.unary_unary(
@@ -72,15 +92,36 @@ class MapServiceStub:
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.ListMapVersionsRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_maps__pb2.ListMapVersionsResponse.FromString,
                 _registered_method=True)
-        self.DownloadMap = channel.unary_stream(
-                '/roel_service.v1.MapService/DownloadMap',
-                request_serializer=roel__service_dot_v1_dot_maps__pb2.DownloadMapRequest.SerializeToString,
-                response_deserializer=roel__service_dot_v1_dot_maps__pb2.DownloadMapResponse.FromString,
+        self.DeleteMapVersion = channel.unary_unary(
+                '/roel_service.v1.MapService/DeleteMapVersion',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
+                _registered_method=True)
+        self.PromoteMapVersion = channel.unary_unary(
+                '/roel_service.v1.MapService/PromoteMapVersion',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.PromoteMapVersionRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+                _registered_method=True)
+        self.ExportMap = channel.unary_stream(
+                '/roel_service.v1.MapService/ExportMap',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.ExportMapRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.ExportMapResponse.FromString,
+                _registered_method=True)
+        self.GetLines = channel.unary_stream(
+                '/roel_service.v1.MapService/GetLines',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.GetLinesRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.GetLinesResponse.FromString,
+                _registered_method=True)
+        self.SyncBlocks = channel.unary_unary(
+                '/roel_service.v1.MapService/SyncBlocks',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.SyncBlocksRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.SyncBlocksResponse.FromString,
                 _registered_method=True)
 
 
 class MapServiceServicer:
-    """Maps of 3D line segments. A map is a name; its versions are immutable.
+    """Maps of 3D line segments. A map is a name; its versions are immutable. Wherever a version is
+    named, an alias may stand in the place of its number, and the answer names the version used.
     """
 
     def CreateMap(self, request, context):
@@ -91,7 +132,7 @@ class MapServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def GetMap(self, request, context):
-        """One map.
+        """One map, also one that is deleted and not yet forgotten.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -104,8 +145,23 @@ class MapServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def UpdateMap(self, request, context):
+        """Changes what may be changed of a map: its display name and its labels.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def DeleteMap(self, request, context):
-        """Deletes a map and all its versions; refused while one is being built.
+        """Deletes a map and all its versions; refused while one is being made. It can be undeleted until
+        its `purge_time`.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def UndeleteMap(self, request, context):
+        """Takes a deletion back.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -118,8 +174,22 @@ class MapServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def RefinePoses(self, request, context):
+        """Refines the poses of a recording, with the lines or against a map that stays as it is.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ImportMap(self, request, context):
+        """Makes a new version of lines from elsewhere.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def GetMapVersion(self, request, context):
-        """One version, or the newest usable one under the alias `latest`.
+        """One version.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -132,8 +202,36 @@ class MapServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
-    def DownloadMap(self, request, context):
-        """The bytes of the map file, in order.
+    def DeleteMapVersion(self, request, context):
+        """Deletes a version; refused while it is being made and while an alias names it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def PromoteMapVersion(self, request, context):
+        """Lets an alias name a version; naming an older one than before is a rollback.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ExportMap(self, request, context):
+        """The lines of a version as a file of some format, in parts.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetLines(self, request, context):
+        """The lines of a version that meet some conditions.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def SyncBlocks(self, request, context):
+        """The blocks of a version's map file that the caller does not hold.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -157,14 +255,34 @@ def add_MapServiceServicer_to_server(servicer, server):
                     request_deserializer=roel__service_dot_v1_dot_maps__pb2.ListMapsRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_maps__pb2.ListMapsResponse.SerializeToString,
             ),
+            'UpdateMap': grpc.unary_unary_rpc_method_handler(
+                    servicer.UpdateMap,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.UpdateMapRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.Map.SerializeToString,
+            ),
             'DeleteMap': grpc.unary_unary_rpc_method_handler(
                     servicer.DeleteMap,
                     request_deserializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapRequest.FromString,
-                    response_serializer=google_dot_protobuf_dot_empty__pb2.Empty.SerializeToString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.Map.SerializeToString,
+            ),
+            'UndeleteMap': grpc.unary_unary_rpc_method_handler(
+                    servicer.UndeleteMap,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.UndeleteMapRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.Map.SerializeToString,
             ),
             'BuildMap': grpc.unary_unary_rpc_method_handler(
                     servicer.BuildMap,
                     request_deserializer=roel__service_dot_v1_dot_maps__pb2.BuildMapRequest.FromString,
+                    response_serializer=google_dot_longrunning_dot_operations__pb2.Operation.SerializeToString,
+            ),
+            'RefinePoses': grpc.unary_unary_rpc_method_handler(
+                    servicer.RefinePoses,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.RefinePosesRequest.FromString,
+                    response_serializer=google_dot_longrunning_dot_operations__pb2.Operation.SerializeToString,
+            ),
+            'ImportMap': grpc.unary_unary_rpc_method_handler(
+                    servicer.ImportMap,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.ImportMapRequest.FromString,
                     response_serializer=google_dot_longrunning_dot_operations__pb2.Operation.SerializeToString,
             ),
             'GetMapVersion': grpc.unary_unary_rpc_method_handler(
@@ -177,10 +295,30 @@ def add_MapServiceServicer_to_server(servicer, server):
                     request_deserializer=roel__service_dot_v1_dot_maps__pb2.ListMapVersionsRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_maps__pb2.ListMapVersionsResponse.SerializeToString,
             ),
-            'DownloadMap': grpc.unary_stream_rpc_method_handler(
-                    servicer.DownloadMap,
-                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.DownloadMapRequest.FromString,
-                    response_serializer=roel__service_dot_v1_dot_maps__pb2.DownloadMapResponse.SerializeToString,
+            'DeleteMapVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.DeleteMapVersion,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.SerializeToString,
+            ),
+            'PromoteMapVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.PromoteMapVersion,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.PromoteMapVersionRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.Map.SerializeToString,
+            ),
+            'ExportMap': grpc.unary_stream_rpc_method_handler(
+                    servicer.ExportMap,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.ExportMapRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.ExportMapResponse.SerializeToString,
+            ),
+            'GetLines': grpc.unary_stream_rpc_method_handler(
+                    servicer.GetLines,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.GetLinesRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.GetLinesResponse.SerializeToString,
+            ),
+            'SyncBlocks': grpc.unary_unary_rpc_method_handler(
+                    servicer.SyncBlocks,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.SyncBlocksRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.SyncBlocksResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -191,7 +329,8 @@ def add_MapServiceServicer_to_server(servicer, server):
 
  # This class is part of an EXPERIMENTAL API.
 class MapService:
-    """Maps of 3D line segments. A map is a name; its versions are immutable.
+    """Maps of 3D line segments. A map is a name; its versions are immutable. Wherever a version is
+    named, an alias may stand in the place of its number, and the answer names the version used.
     """
 
     @staticmethod
@@ -276,6 +415,33 @@ class MapService:
             _registered_method=True)
 
     @staticmethod
+    def UpdateMap(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/UpdateMap',
+            roel__service_dot_v1_dot_maps__pb2.UpdateMapRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
     def DeleteMap(request,
             target,
             options=(),
@@ -291,7 +457,34 @@ class MapService:
             target,
             '/roel_service.v1.MapService/DeleteMap',
             roel__service_dot_v1_dot_maps__pb2.DeleteMapRequest.SerializeToString,
-            google_dot_protobuf_dot_empty__pb2.Empty.FromString,
+            roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UndeleteMap(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/UndeleteMap',
+            roel__service_dot_v1_dot_maps__pb2.UndeleteMapRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.Map.FromString,
             options,
             channel_credentials,
             insecure,
@@ -318,6 +511,60 @@ class MapService:
             target,
             '/roel_service.v1.MapService/BuildMap',
             roel__service_dot_v1_dot_maps__pb2.BuildMapRequest.SerializeToString,
+            google_dot_longrunning_dot_operations__pb2.Operation.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RefinePoses(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/RefinePoses',
+            roel__service_dot_v1_dot_maps__pb2.RefinePosesRequest.SerializeToString,
+            google_dot_longrunning_dot_operations__pb2.Operation.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ImportMap(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/ImportMap',
+            roel__service_dot_v1_dot_maps__pb2.ImportMapRequest.SerializeToString,
             google_dot_longrunning_dot_operations__pb2.Operation.FromString,
             options,
             channel_credentials,
@@ -384,7 +631,61 @@ class MapService:
             _registered_method=True)
 
     @staticmethod
-    def DownloadMap(request,
+    def DeleteMapVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/DeleteMapVersion',
+            roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PromoteMapVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/PromoteMapVersion',
+            roel__service_dot_v1_dot_maps__pb2.PromoteMapVersionRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ExportMap(request,
             target,
             options=(),
             channel_credentials=None,
@@ -397,9 +698,63 @@ class MapService:
         return grpc.experimental.unary_stream(
             request,
             target,
-            '/roel_service.v1.MapService/DownloadMap',
-            roel__service_dot_v1_dot_maps__pb2.DownloadMapRequest.SerializeToString,
-            roel__service_dot_v1_dot_maps__pb2.DownloadMapResponse.FromString,
+            '/roel_service.v1.MapService/ExportMap',
+            roel__service_dot_v1_dot_maps__pb2.ExportMapRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.ExportMapResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetLines(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/roel_service.v1.MapService/GetLines',
+            roel__service_dot_v1_dot_maps__pb2.GetLinesRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.GetLinesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SyncBlocks(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/SyncBlocks',
+            roel__service_dot_v1_dot_maps__pb2.SyncBlocksRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.SyncBlocksResponse.FromString,
             options,
             channel_credentials,
             insecure,

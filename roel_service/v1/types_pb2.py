@@ -24,15 +24,15 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1broel_service/v1/types.proto\x12\x0froel_service.v1\"\xa4\x01\n\x06\x43\x61mera\x12\r\n\x05width\x18\x01 \x01(\x05\x12\x0e\n\x06height\x18\x02 \x01(\x05\x12\r\n\x05\x66x_px\x18\x03 \x01(\x01\x12\r\n\x05\x66y_px\x18\x04 \x01(\x01\x12\r\n\x05\x63x_px\x18\x05 \x01(\x01\x12\r\n\x05\x63y_px\x18\x06 \x01(\x01\x12+\n\x05model\x18\x07 \x01(\x0e\x32\x1c.roel_service.v1.CameraModel\x12\x12\n\ndistortion\x18\x08 \x03(\x01\"C\n\nTrajectory\x12\x0c\n\x04t_us\x18\x01 \x01(\x0c\x12\x15\n\rtranslation_m\x18\x02 \x01(\x0c\x12\x10\n\x08rotation\x18\x03 \x01(\x0c\"-\n\x07\x42lobRef\x12\x0e\n\x06sha256\x18\x01 \x01(\t\x12\x12\n\nsize_bytes\x18\x02 \x01(\x03\"n\n\x06\x42ounds\x12\x0f\n\x07min_x_m\x18\x01 \x01(\x01\x12\x0f\n\x07min_y_m\x18\x02 \x01(\x01\x12\x0f\n\x07min_z_m\x18\x03 \x01(\x01\x12\x0f\n\x07max_x_m\x18\x04 \x01(\x01\x12\x0f\n\x07max_y_m\x18\x05 \x01(\x01\x12\x0f\n\x07max_z_m\x18\x06 \x01(\x01*_\n\x0b\x43\x61meraModel\x12\x1c\n\x18\x43\x41MERA_MODEL_UNSPECIFIED\x10\x00\x12\x18\n\x14\x43\x41MERA_MODEL_PINHOLE\x10\x01\x12\x18\n\x14\x43\x41MERA_MODEL_FISHEYE\x10\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1broel_service/v1/types.proto\x12\x0froel_service.v1\"\xa4\x01\n\x06\x43\x61mera\x12\r\n\x05width\x18\x01 \x01(\x05\x12\x0e\n\x06height\x18\x02 \x01(\x05\x12\r\n\x05\x66x_px\x18\x03 \x01(\x01\x12\r\n\x05\x66y_px\x18\x04 \x01(\x01\x12\r\n\x05\x63x_px\x18\x05 \x01(\x01\x12\r\n\x05\x63y_px\x18\x06 \x01(\x01\x12+\n\x05model\x18\x07 \x01(\x0e\x32\x1c.roel_service.v1.CameraModel\x12\x12\n\ndistortion\x18\x08 \x03(\x01\"C\n\nTrajectory\x12\x0c\n\x04t_us\x18\x01 \x01(\x0c\x12\x15\n\rtranslation_m\x18\x02 \x01(\x0c\x12\x10\n\x08rotation\x18\x03 \x01(\x0c\"-\n\x07\x42lobRef\x12\x0e\n\x06sha256\x18\x01 \x01(\t\x12\x12\n\nsize_bytes\x18\x02 \x01(\x03\"n\n\x06\x42ounds\x12\x0f\n\x07min_x_m\x18\x01 \x01(\x01\x12\x0f\n\x07min_y_m\x18\x02 \x01(\x01\x12\x0f\n\x07min_z_m\x18\x03 \x01(\x01\x12\x0f\n\x07max_x_m\x18\x04 \x01(\x01\x12\x0f\n\x07max_y_m\x18\x05 \x01(\x01\x12\x0f\n\x07max_z_m\x18\x06 \x01(\x01\"*\n\x07Vector3\x12\t\n\x01x\x18\x01 \x01(\x01\x12\t\n\x01y\x18\x02 \x01(\x01\x12\t\n\x01z\x18\x03 \x01(\x01\"z\n\tTransform\x12\x14\n\x0ctarget_frame\x18\x01 \x01(\t\x12\x14\n\x0csource_frame\x18\x02 \x01(\t\x12/\n\rtranslation_m\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.Vector3\x12\x10\n\x08rotation\x18\x04 \x03(\x01\"\x19\n\x07Matrix6\x12\x0e\n\x06values\x18\x01 \x03(\x01\"\x1a\n\x06Points\x12\x10\n\x08points_m\x18\x01 \x01(\x0c*_\n\x0b\x43\x61meraModel\x12\x1c\n\x18\x43\x41MERA_MODEL_UNSPECIFIED\x10\x00\x12\x18\n\x14\x43\x41MERA_MODEL_PINHOLE\x10\x01\x12\x18\n\x14\x43\x41MERA_MODEL_FISHEYE\x10\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'roel_service.v1.types_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_CAMERAMODEL']._serialized_start=443
-  _globals['_CAMERAMODEL']._serialized_end=538
+  _globals['_CAMERAMODEL']._serialized_start=666
+  _globals['_CAMERAMODEL']._serialized_end=761
   _globals['_CAMERA']._serialized_start=49
   _globals['_CAMERA']._serialized_end=213
   _globals['_TRAJECTORY']._serialized_start=215
@@ -41,4 +41,12 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_BLOBREF']._serialized_end=329
   _globals['_BOUNDS']._serialized_start=331
   _globals['_BOUNDS']._serialized_end=441
+  _globals['_VECTOR3']._serialized_start=443
+  _globals['_VECTOR3']._serialized_end=485
+  _globals['_TRANSFORM']._serialized_start=487
+  _globals['_TRANSFORM']._serialized_end=609
+  _globals['_MATRIX6']._serialized_start=611
+  _globals['_MATRIX6']._serialized_end=636
+  _globals['_POINTS']._serialized_start=638
+  _globals['_POINTS']._serialized_end=664
 # @@protoc_insertion_point(module_scope)
