@@ -10,6 +10,7 @@
     │   └── ConflictError   somebody else was faster
     ├── LimitError          quota, full queue, too large
     ├── UnavailableError    draining, or the server cannot be reached
+    ├── UnimplementedError  the protocol has the method, this server does not
     └── CorruptionError     stored bytes do not match their digest
     Cancelled               raised through a progress callback; not a fault
 
@@ -158,6 +159,12 @@ class UnavailableError(RoelError):
     """The server is draining or cannot be reached."""
 
     default_reason = "UNAVAILABLE"
+
+
+class UnimplementedError(RoelError):
+    """The protocol has the method, this server does not."""
+
+    default_reason = "METHOD_NOT_IMPLEMENTED"
 
 
 class CorruptionError(RoelError):

@@ -27,6 +27,7 @@ from roel_service.errors import (
     StateError,
     TrajectoryError,
     UnavailableError,
+    UnimplementedError,
 )
 
 
@@ -125,6 +126,11 @@ _ROWS = (
         UnavailableError,
         "a build whose process was killed, or whose server was",
         retry_after_s=1.0,
+    ),
+    Reason(
+        "METHOD_NOT_IMPLEMENTED",
+        UnimplementedError,
+        "a method that the protocol has and this server does not; GetCapabilities lists them",
     ),
     Reason(
         "BLOB_CORRUPT",

@@ -182,17 +182,18 @@ class AsyncClient:
     async def download_map(self, name: str) -> bytes:
         """The map file of a version; raises `CorruptionError` unless it is what was built."""
         version = await self.map_version(name)
-        request = maps_pb2.DownloadMapRequest(name=version.name)
-        parts = self._connection.stream(self._maps.DownloadMap, request)
+        request = maps_pb2.ExportMapRequest(name=version.name)
+        parts = self._connection.stream(self._maps.ExportMap, request)
         data = b"".join([part.data async for part in parts])
         found = hashlib.sha256(data).hexdigest()
         if found != version.map.sha256:
             raise CorruptionError(version.name, f"bytes of digest {version.map.sha256}", found)
         return data
 
-    async def delete_map(self, name: str) -> None:
-        """Delete a map with all its versions."""
-        await self._connection.call(self._maps.DeleteMap, maps_pb2.DeleteMapRequest(name=name))
+    async def delete_map(self, name: str, *, purge: bool = False) -> None:
+        """Delete a map with all its versions; it can be undeleted unless it is purged."""
+        request = maps_pb2.DeleteMapRequest(name=name, purge=purge)
+        await self._connection.call(self._maps.DeleteMap, request)
 
     async def _append_events(
         self, stream: str, source: EventSource, progress: ProgressCallback
@@ -217,7 +218,7 @@ class AsyncClient:
             yield name
         finally:
             with contextlib.suppress(RoelError):
-                await self.delete_map(name)
+                await self.delete_map(name, purge=True)
 
 
 class AsyncOperation:
@@ -269,7 +270,7 @@ class AsyncOperation:
                 self._update_seq = answer.update_seq
                 if answer.operation.done:
                     return answer.operation
-                metadata = maps_pb2.BuildMapMetadata()
+                metadata = roel_operations_pb2.OperationMetadata()
                 answer.operation.metadata.Unpack(metadata)
                 progress(progress_from_proto(metadata))
         raise RoelError(self.name, "an operation that ends", "a watch that ended before it")

@@ -179,17 +179,18 @@ class Client:
     def download_map(self, name: str) -> bytes:
         """The map file of a version; raises `CorruptionError` unless it is what was built."""
         version = self.map_version(name)
-        request = maps_pb2.DownloadMapRequest(name=version.name)
-        parts = self._connection.stream(self._maps.DownloadMap, request)
+        request = maps_pb2.ExportMapRequest(name=version.name)
+        parts = self._connection.stream(self._maps.ExportMap, request)
         data = b"".join([part.data for part in parts])
         found = hashlib.sha256(data).hexdigest()
         if found != version.map.sha256:
             raise CorruptionError(version.name, f"bytes of digest {version.map.sha256}", found)
         return data
 
-    def delete_map(self, name: str) -> None:
-        """Delete a map with all its versions."""
-        self._connection.call(self._maps.DeleteMap, maps_pb2.DeleteMapRequest(name=name))
+    def delete_map(self, name: str, *, purge: bool = False) -> None:
+        """Delete a map with all its versions; it can be undeleted unless it is purged."""
+        request = maps_pb2.DeleteMapRequest(name=name, purge=purge)
+        self._connection.call(self._maps.DeleteMap, request)
 
     def _append_events(
         self, stream: str, source: EventSource, progress: ProgressCallback
@@ -214,7 +215,7 @@ class Client:
             yield name
         finally:
             with contextlib.suppress(RoelError):
-                self.delete_map(name)
+                self.delete_map(name, purge=True)
 
 
 class Operation:

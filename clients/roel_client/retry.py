@@ -27,7 +27,8 @@ HARMLESS_VERBS = (
     "Read",
     "Wait",
     "Watch",
-    "Download",
+    "Export",
+    "Sync",
     "Cancel",
     "Finalize",
 )

@@ -14,6 +14,8 @@ from roel_service.io.files import whole_file
 from roel_service.io.npz import read_npz, write_npz
 from roel_service.scene.lines import LineMap
 
+EXPORT_FORMATS = ("npz", "ply", "obj", "json", "csv", "dxf")
+
 _FIELDS = ("segments", "observation_count", "rms_residual", "sigma_m")
 
 

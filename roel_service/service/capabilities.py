@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from roel_service import __version__
 from roel_service.config.presets import PRESETS
+from roel_service.config.stages import DETECTORS, MATCHERS
+from roel_service.io.maps import EXPORT_FORMATS
 from roel_service.scene.results import MAPPING_STAGES
+from roel_service.service.methods import is_implemented, method_name
 from roel_service.service.settings import Settings
 from roel_service.v1 import capabilities_pb2
+from roel_service.wire import chunks, rlm
 
 
 class CapabilitiesServicer:
-    """Answers from the settings alone."""
+    """Answers from the settings, the code and the servicers.
 
-    def __init__(self, settings: Settings) -> None:
+    Args:
+        servicers: what answers each service, by its descriptor; this one is among them.
+    """
+
+    def __init__(self, settings: Settings, servicers: Mapping[Any, object]) -> None:
         self._settings = settings
+        self._servicers = servicers
 
     async def GetCapabilities(
         self, request: capabilities_pb2.GetCapabilitiesRequest, context: Any
@@ -27,4 +37,21 @@ class CapabilitiesServicer:
             limits=capabilities_pb2.Limits(**limits),
             presets=list(PRESETS),
             stages=MAPPING_STAGES,
+            chunk_versions=[chunks.CHUNK_VERSION],
+            chunk_encodings=["columnar-zstd"],
+            map_file_version=f"{rlm.FORMAT_MAJOR}.{rlm.FORMAT_MINOR}",
+            export_formats=["rlm", *EXPORT_FORMATS],
+            detectors=DETECTORS,
+            matchers=MATCHERS,
+            methods=self._methods(),
         )
+
+    def _methods(self) -> list[capabilities_pb2.Method]:
+        methods = (
+            capabilities_pb2.Method(
+                name=method_name(method), implemented=is_implemented(servicer, method)
+            )
+            for service, servicer in self._servicers.items()
+            for method in service.methods
+        )
+        return sorted(methods, key=lambda method: method.name)

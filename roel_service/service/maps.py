@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any
 
 from google.longrunning import operations_pb2
-from google.protobuf.empty_pb2 import Empty
 
 from roel_service.config.stages import Config
 from roel_service.errors import ConfigError
@@ -56,9 +55,11 @@ class MapServicer:
             next_page_token=page.next_page_token,
         )
 
-    async def DeleteMap(self, request: maps_pb2.DeleteMapRequest, context: Any) -> Empty:
-        await asyncio.to_thread(self._store.maps.delete, names.map_id(request.name))
-        return Empty()
+    async def DeleteMap(self, request: maps_pb2.DeleteMapRequest, context: Any) -> maps_pb2.Map:
+        map_id = names.map_id(request.name)
+        record = await asyncio.to_thread(self._store.maps.get, map_id)
+        await asyncio.to_thread(self._store.maps.delete, map_id)
+        return map_to_proto(record)
 
     async def BuildMap(
         self, request: maps_pb2.BuildMapRequest, context: Any
@@ -87,14 +88,17 @@ class MapServicer:
             next_page_token=page.next_page_token,
         )
 
-    async def DownloadMap(
-        self, request: maps_pb2.DownloadMapRequest, context: Any
-    ) -> AsyncIterator[maps_pb2.DownloadMapResponse]:
+    async def ExportMap(
+        self, request: maps_pb2.ExportMapRequest, context: Any
+    ) -> AsyncIterator[maps_pb2.ExportMapResponse]:
         record = await self._version(request.name)
         data = await asyncio.to_thread(self._store.maps.map_file, record)
+        yield maps_pb2.ExportMapResponse(
+            map_version=names.map_version_name(record.map_id, record.version), size_bytes=len(data)
+        )
         size = self._settings.download_part_bytes
         for start in range(0, len(data), size):
-            yield maps_pb2.DownloadMapResponse(data=data[start : start + size])
+            yield maps_pb2.ExportMapResponse(data=data[start : start + size])
 
     async def _version(self, name: str) -> MapVersionRecord:
         return await asyncio.to_thread(self._store.maps.version, *names.map_version_id(name))

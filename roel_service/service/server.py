@@ -11,39 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import grpc
-from google.longrunning import operations_pb2, operations_pb2_grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from roel_service.errors import InputError, UnavailableError
 from roel_service.jobs.scheduler import Scheduler
-from roel_service.service.capabilities import CapabilitiesServicer
-from roel_service.service.event_streams import EventStreamServicer
 from roel_service.service.interceptors import ErrorInterceptor
-from roel_service.service.maps import MapServicer
-from roel_service.service.operations import OperationServicer
+from roel_service.service.services import SERVICES, add_services
 from roel_service.service.settings import Settings
 from roel_service.store.store import Store
-from roel_service.v1 import (
-    capabilities_pb2,
-    capabilities_pb2_grpc,
-    events_pb2,
-    events_pb2_grpc,
-    maps_pb2,
-    maps_pb2_grpc,
-)
-from roel_service.v1 import operations_pb2 as roel_operations_pb2
-from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 
 logger = logging.getLogger(__name__)
-
-SERVICES = (
-    capabilities_pb2.DESCRIPTOR.services_by_name["CapabilitiesService"].full_name,
-    events_pb2.DESCRIPTOR.services_by_name["EventStreamService"].full_name,
-    maps_pb2.DESCRIPTOR.services_by_name["MapService"].full_name,
-    roel_operations_pb2.DESCRIPTOR.services_by_name["OperationService"].full_name,
-    operations_pb2.DESCRIPTOR.services_by_name["Operations"].full_name,
-)
 
 # A client that pings more often than this is told to calm down; ours pings every 20 s.
 MIN_PING_INTERVAL_MS = 10_000
@@ -81,7 +59,7 @@ async def serve(
         server = grpc.aio.server(
             interceptors=[ErrorInterceptor()], options=_options(settings), compression=None
         )
-        _add_services(server, store, scheduler, settings)
+        add_services(server, store, scheduler, settings)
         health_servicer = await _add_health(server)
         address = _bind(server, host, port)
         await server.start()
@@ -122,19 +100,6 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         # Otherwise a second server shares the port and takes half of the calls.
         ("grpc.so_reuseport", 0),
     ]
-
-
-def _add_services(server: Any, store: Store, scheduler: Scheduler, settings: Settings) -> None:
-    operations = OperationServicer(store, scheduler)
-    capabilities_pb2_grpc.add_CapabilitiesServiceServicer_to_server(
-        CapabilitiesServicer(settings), server
-    )
-    events_pb2_grpc.add_EventStreamServiceServicer_to_server(
-        EventStreamServicer(store.event_streams, settings), server
-    )
-    maps_pb2_grpc.add_MapServiceServicer_to_server(MapServicer(store, scheduler, settings), server)
-    roel_operations_pb2_grpc.add_OperationServiceServicer_to_server(operations, server)
-    operations_pb2_grpc.add_OperationsServicer_to_server(operations, server)
 
 
 async def _add_health(server: Any) -> Any:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from roel_service.service.paging import MAX_PAGE_SIZE
+from roel_service.store import retention
 from roel_service.wire.chunks import MAX_CHUNK_EVENT_COUNT
+from roel_service.wire.rlm import MAX_LINE_COUNT
 
 MIB = 2**20
 GIB = 2**30
@@ -22,6 +25,10 @@ class Settings:
         queued_builds: builds that may wait for a child.
         commit_bytes: an upload is made durable at least this often.
         download_part_bytes: size of the messages of a download.
+        lines_per_message: most lines of a message of GetLines.
+        label_count: most labels of a resource.
+        display_name_length: most characters of a display name.
+        alias_count: most aliases of a map.
         drain_grace_s: how long calls may go on after SIGTERM.
         build_entrypoint: `module:function` of a build, imported in the child alone.
     """
@@ -34,6 +41,10 @@ class Settings:
     queued_builds: int = 16
     commit_bytes: int = 8 * MIB
     download_part_bytes: int = MIB
+    lines_per_message: int = 100_000
+    label_count: int = 64
+    display_name_length: int = 200
+    alias_count: int = 64
     drain_grace_s: float = 2.0
     build_entrypoint: str = "roel_service.jobs.build:run_build"
 
@@ -41,3 +52,28 @@ class Settings:
     def events_per_chunk(self) -> int:
         """Most events of a chunk; the format decides."""
         return MAX_CHUNK_EVENT_COUNT
+
+    @property
+    def line_count(self) -> int:
+        """Most lines of a map; the format decides."""
+        return MAX_LINE_COUNT
+
+    @property
+    def page_size(self) -> int:
+        """Most items of a page."""
+        return MAX_PAGE_SIZE
+
+    @property
+    def operation_retention_days(self) -> int:
+        """How long an ended operation is remembered."""
+        return retention.OPERATION_RETENTION_DAYS
+
+    @property
+    def request_retention_days(self) -> int:
+        """How long a request id is remembered."""
+        return retention.REQUEST_RETENTION_DAYS
+
+    @property
+    def deleted_map_retention_days(self) -> int:
+        """How long a deleted map can be undeleted."""
+        return retention.DELETED_MAP_RETENTION_DAYS

@@ -28,9 +28,9 @@ from roel_service.wire.byte_planes import (
 MAX_CHUNK_EVENT_COUNT = 131_072
 # Longest time between neighbours in a chunk: what four bytes hold.
 MAX_STEP_US = 2**32 - 1
+CHUNK_VERSION = 1
 
 _MAGIC = b"REC1"
-_VERSION = 1
 _COLUMNAR_ZSTD = 1
 # Byte planes hold hardly a repetition worth finding: what counts is the entropy coder. A tiny table
 # of long matches finds those few, and is faster and smaller than level 3 (on a simulated room 2.66
@@ -160,7 +160,7 @@ def encode_chunk(events: EventStream) -> bytes:
     header = _HEADER.pack(
         *_Header(
             magic=_MAGIC,
-            version=_VERSION,
+            version=CHUNK_VERSION,
             encoding=_COLUMNAR_ZSTD,
             width_bytes=width_bytes,
             flags=0,
@@ -258,8 +258,8 @@ def _read_header(data: bytes) -> _Header:
     if header.magic != _MAGIC:
         raise _malformed(f"the magic {_MAGIC!r}", f"{header.magic!r}")
     _check_crc("header", data[: _HEADER.size], _CRC.unpack_from(data, _HEADER.size)[0])
-    if (header.version, header.encoding) != (_VERSION, _COLUMNAR_ZSTD):
-        expected = f"version {_VERSION}, encoding {_COLUMNAR_ZSTD}"
+    if (header.version, header.encoding) != (CHUNK_VERSION, _COLUMNAR_ZSTD):
+        expected = f"version {CHUNK_VERSION}, encoding {_COLUMNAR_ZSTD}"
         found = f"version {header.version}, encoding {header.encoding}"
         raise EventsError(_SUBJECT, expected, found, reason="UNSUPPORTED_ENCODING")
     if header.width_bytes not in (2, 4) or header.flags or header.reserved:

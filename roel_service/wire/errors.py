@@ -29,6 +29,7 @@ CODES: tuple[tuple[type[RoelError], int], ...] = (
     (errors.StateError, code_pb2.FAILED_PRECONDITION),
     (errors.LimitError, code_pb2.RESOURCE_EXHAUSTED),
     (errors.UnavailableError, code_pb2.UNAVAILABLE),
+    (errors.UnimplementedError, code_pb2.UNIMPLEMENTED),
     (errors.CorruptionError, code_pb2.DATA_LOSS),
     (errors.RoelError, code_pb2.INTERNAL),
 )
@@ -48,6 +49,7 @@ FALLBACK: dict[int, type[RoelError]] = {
     code_pb2.RESOURCE_EXHAUSTED: errors.LimitError,
     code_pb2.UNAVAILABLE: errors.UnavailableError,
     code_pb2.DEADLINE_EXCEEDED: errors.UnavailableError,
+    code_pb2.UNIMPLEMENTED: errors.UnimplementedError,
     code_pb2.DATA_LOSS: errors.CorruptionError,
 }
 

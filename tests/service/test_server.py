@@ -20,7 +20,8 @@ from roel_client.connection import Connection, Endpoint
 from roel_service import __version__
 from roel_service.errors import InputError, RoelError, UnavailableError
 from roel_service.scene.results import MAPPING_STAGES
-from roel_service.service.server import SERVICES, serve
+from roel_service.service.server import serve
+from roel_service.service.services import SERVICES
 from roel_service.v1 import events_pb2, events_pb2_grpc
 from roel_service.wire.chunks import encode_chunk, split_chunks
 

@@ -78,7 +78,8 @@ def test_long_texts_are_cut_to_fit_a_header():
         (code_pb2.UNAVAILABLE, errors.UnavailableError, "UNAVAILABLE"),
         (code_pb2.DEADLINE_EXCEEDED, errors.UnavailableError, "UNAVAILABLE"),
         (code_pb2.RESOURCE_EXHAUSTED, errors.LimitError, "LIMIT_EXCEEDED"),
-        (code_pb2.UNIMPLEMENTED, RoelError, "INTERNAL"),
+        (code_pb2.UNIMPLEMENTED, errors.UnimplementedError, "METHOD_NOT_IMPLEMENTED"),
+        (code_pb2.UNKNOWN, RoelError, "INTERNAL"),
     ],
 )
 def test_a_status_without_details_names_who_answered(code, kind, reason):

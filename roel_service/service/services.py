@@ -1,0 +1,80 @@
+"""The services of this server and who answers them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from google.longrunning import operations_pb2, operations_pb2_grpc
+
+from roel_service.jobs.scheduler import Scheduler
+from roel_service.service.capabilities import CapabilitiesServicer
+from roel_service.service.event_streams import EventStreamServicer
+from roel_service.service.maps import MapServicer
+from roel_service.service.methods import complete
+from roel_service.service.operations import OperationServicer
+from roel_service.service.settings import Settings
+from roel_service.store.store import Store
+from roel_service.v1 import (
+    capabilities_pb2,
+    capabilities_pb2_grpc,
+    events_pb2,
+    events_pb2_grpc,
+    localization_pb2,
+    localization_pb2_grpc,
+    maps_pb2,
+    maps_pb2_grpc,
+    registration_pb2,
+    registration_pb2_grpc,
+)
+from roel_service.v1 import operations_pb2 as roel_operations_pb2
+from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
+
+# The file that declares each service, and the function that adds its servicer.
+_DECLARED = {
+    "CapabilitiesService": (
+        capabilities_pb2,
+        capabilities_pb2_grpc.add_CapabilitiesServiceServicer_to_server,
+    ),
+    "EventStreamService": (
+        events_pb2,
+        events_pb2_grpc.add_EventStreamServiceServicer_to_server,
+    ),
+    "MapService": (maps_pb2, maps_pb2_grpc.add_MapServiceServicer_to_server),
+    "RegistrationService": (
+        registration_pb2,
+        registration_pb2_grpc.add_RegistrationServiceServicer_to_server,
+    ),
+    "LocalizationService": (
+        localization_pb2,
+        localization_pb2_grpc.add_LocalizationServiceServicer_to_server,
+    ),
+    "OperationService": (
+        roel_operations_pb2,
+        roel_operations_pb2_grpc.add_OperationServiceServicer_to_server,
+    ),
+    "Operations": (operations_pb2, operations_pb2_grpc.add_OperationsServicer_to_server),
+}
+
+_DESCRIPTORS = {
+    name: module.DESCRIPTOR.services_by_name[name] for name, (module, _) in _DECLARED.items()
+}
+
+# Full names, such as `roel_service.v1.MapService`.
+SERVICES = tuple(descriptor.full_name for descriptor in _DESCRIPTORS.values())
+
+
+def add_services(server: Any, store: Store, scheduler: Scheduler, settings: Settings) -> None:
+    """Add every service of the protocol; methods that nobody wrote yet refuse."""
+    operations = OperationServicer(store, scheduler)
+    servicers: dict[str, object] = {
+        "EventStreamService": EventStreamServicer(store.event_streams, settings),
+        "MapService": MapServicer(store, scheduler, settings),
+        "OperationService": operations,
+        "Operations": operations,
+    }
+    answered = {descriptor: servicers.get(name) for name, descriptor in _DESCRIPTORS.items()}
+    capabilities = CapabilitiesServicer(settings, answered)
+    answered[_DESCRIPTORS["CapabilitiesService"]] = capabilities
+    for descriptor, servicer in answered.items():
+        _, add = _DECLARED[descriptor.name]
+        add(complete(descriptor, servicer), server)
