@@ -83,6 +83,7 @@ _ROWS = (
         "an unknown table, key or preset, or a value of a wrong type or range",
     ),
     Reason("CLOUD_INVALID", CloudError, "a point cloud that cannot be used"),
+    Reason("CLOUD_UNIT", CloudError, "a point cloud in another unit than the map"),
     Reason("MESH_INVALID", MeshError, "a mesh that cannot be used"),
     Reason("PANORAMA_INVALID", PanoramaError, "an image that is no panorama"),
     Reason("MAP_FILE_INVALID", MapFileError, "a map file that is damaged or of an unknown format"),
@@ -96,6 +97,7 @@ _ROWS = (
     Reason("INSECURE_HOST", InputError, "serving another host than loopback without `--insecure`"),
     Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
     Reason("TOO_FEW_LINES", NoAnswerError, "a map of fewer than three lines"),
+    Reason("NOT_REGISTERED", NoAnswerError, "a registration not to be relied on, with `--strict`"),
     Reason("NOT_FOUND", NotFoundError, "a resource that does not exist"),
     Reason(
         "WRONG_STATE",

@@ -121,9 +121,9 @@ def _processor() -> str:
 
 
 def config_digest(config: Config) -> str:
-    """Twelve hexadecimal digits that change with any parameter but those of the runtime."""
+    """Twelve hexadecimal digits that change with any parameter of mapping."""
     tables = to_tables(config)
-    del tables["runtime"]
+    del tables["runtime"], tables["register"]
     return digest_of(json.dumps(tables, sort_keys=True))
 
 

@@ -6,6 +6,7 @@ Files are named as the user gave them, because errors repeat the name.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 from roel_client.naming import naming
 
 if TYPE_CHECKING:
-    from roel_service.config.stages import Config
+    from roel_service.config.stages import Config, RegisterConfig
     from roel_service.io.events import EventFile
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
+    from roel_service.scene.results import RegistrationResult
     from roel_service.scene.trajectory import Trajectory
     from roel_service.wire.rlm import MapFile
 
@@ -150,6 +152,56 @@ def _read_map(name: str) -> LineMap:
     with open_input(Path(name)) as file:
         is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
     return read_map_file(name).line_map if is_map_file else read_exported_map(Path(name))
+
+
+def register_map(
+    name: str,
+    cloud_name: str,
+    *,
+    init: str | None,
+    method: str,
+    config: RegisterConfig,
+    plot: Path | None,
+) -> dict[str, Any]:
+    """Register a map with a cloud; the keys of `roel register`."""
+    from roel_service.evaluation.registration_figures import draw_registration
+    from roel_service.geometry.se3 import SE3
+    from roel_service.io.clouds import read_cloud
+    from roel_service.io.transforms import read_transform
+    from roel_service.register import register
+
+    T_init = SE3.identity() if init is None else read_transform(Path(init))
+    line_map = _read_map(name)
+    cloud = read_cloud(Path(cloud_name))
+    started_s = time.perf_counter()
+    with naming({"map": name, "cloud": cloud_name}):
+        result = register.register_map(line_map, cloud, config, method=method, T_init=T_init)
+    seconds = time.perf_counter() - started_s
+    if plot is not None:
+        draw_registration(line_map, cloud, T_init, result, plot)
+    return _registration_document(result, seconds)
+
+
+def _registration_document(result: RegistrationResult, seconds: float) -> dict[str, Any]:
+    information = result.information
+    return {
+        "T_target_source": result.T_target_source.matrix().tolist(),
+        "scale": result.scale,
+        "converged": result.converged,
+        "stop_reason": result.stop_reason.value,
+        "verdict": result.verdict.value,
+        "fitness": result.fitness,
+        "overlap": result.overlap,
+        "inlier_rmse_m": result.inlier_rmse_m,
+        "information": None if information is None else information.tolist(),
+        "weak_directions": result.weak_directions.tolist(),
+        "alternatives": [
+            {"T_target_source": other.T_target_source.matrix().tolist(), "score": other.score}
+            for other in result.alternatives
+        ],
+        "iteration_count": result.iteration_count,
+        "seconds": seconds,
+    }
 
 
 def simulate(folder: Path, seed: int, progress: ProgressCallback, **given: Any) -> int:

@@ -366,6 +366,31 @@ class TrimConfig(Stage, table="trim"):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RegisterConfig(Stage, table="register"):
+    """Maps laid onto point clouds.
+
+    Attributes:
+        voxel_m: clouds are thinned to one point in each cube of this size.
+        max_distance_m: a sample of the map with a point of the cloud this close counts as fitting.
+        sample_spacing_m: spacing of the points along lines of method `point`.
+        point_gate_m: pairs of method `point` farther apart than this do not count.
+        point_iteration_count: at most so many iterations of method `point`.
+        estimate_scale: whether the map's unit is unknown, as that of poses from one camera is.
+        gravity_aligned: whether z is vertical on both sides; `global` then looks for a heading only.
+        min_fitness: a smaller share of fitting samples is no registration.
+    """
+
+    voxel_m: float = parameter(0.02, POSITIVE)
+    max_distance_m: float = parameter(0.05, POSITIVE)
+    sample_spacing_m: float = parameter(0.005, POSITIVE)
+    point_gate_m: float = parameter(0.5, POSITIVE)
+    point_iteration_count: int = parameter(100, UP_TO_1000)
+    estimate_scale: bool = False
+    gravity_aligned: bool = True
+    min_fitness: float = parameter(0.5, SHARE)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RuntimeConfig(Stage, table="runtime"):
     """How the work is done; nothing but speed depends on it, except for the seed.
 
@@ -390,4 +415,5 @@ class Config:
     triangulate: TriangulateConfig = TriangulateConfig()
     refine: RefineConfig = RefineConfig()
     trim: TrimConfig = TrimConfig()
+    register: RegisterConfig = RegisterConfig()
     runtime: RuntimeConfig = RuntimeConfig()

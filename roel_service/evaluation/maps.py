@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from roel_service.arrays import FloatArray
 from roel_service.errors import CloudError, MapFileError, MeshError, NoAnswerError
+from roel_service.geometry.segments import sample_segments
 from roel_service.scene.clouds import PointCloud, TriangleMesh
 from roel_service.scene.lines import LineMap
 
@@ -101,25 +102,15 @@ def evaluate_points(
 def sample_lines(line_map: LineMap, spacing_m: float = SAMPLE_SPACING_M) -> FloatArray:
     """(P, 3) m, equally spaced along each line, both ends included.
 
-    The spacing is the largest one up to `spacing_m` that divides the line, so that a line and its
-    reverse have the same points; a line without length gives its one place twice.
-
     Raises:
         MapFileError: more than `MAX_SAMPLE_COUNT` points.
     """
     with np.errstate(over="ignore"):  # an infinite length is refused like any long one
         lengths_m = line_map.lengths_m
-    # A millionth of a step is rounding, not another sample.
-    steps = np.maximum(np.ceil(lengths_m / spacing_m - 1e-6), 1.0)
-    if steps.sum() + len(steps) > MAX_SAMPLE_COUNT:
+    if (lengths_m / spacing_m).sum() + 2 * len(line_map) > MAX_SAMPLE_COUNT:
         expected = f"lines of at most {MAX_SAMPLE_COUNT * spacing_m:.0f} m together"
         raise MapFileError("map", expected, f"{lengths_m.sum():.0f} m")
-    counts = steps.astype(np.int64) + 1
-    line = np.repeat(np.arange(len(line_map)), counts)
-    first = np.cumsum(counts) - counts
-    fraction = ((np.arange(len(line)) - first[line]) / steps[line])[:, None]
-    start, end = line_map.segments[line, 0], line_map.segments[line, 1]
-    return np.asarray((1.0 - fraction) * start + fraction * end)
+    return sample_segments(line_map.segments, spacing_m)[0]
 
 
 def distances_to_mesh(points: FloatArray, mesh: TriangleMesh) -> FloatArray:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import FloatArray, IntArray
 from roel_service.geometry.vectors import angle_between, dot, norm, unit
 
 # Cosine of the angle beyond which two segments count as orthogonal: neither faces the other.
@@ -34,6 +34,29 @@ def length(segments: FloatArray) -> FloatArray:
 def midpoint(segments: FloatArray) -> FloatArray:
     """(*B, D) mid-points."""
     return np.asarray(segments.mean(axis=-2), dtype=np.float64)
+
+
+def sample_segments(segments: FloatArray, spacing: float) -> tuple[FloatArray, IntArray]:
+    """Points that are equally spaced along each segment, both ends included.
+
+    The spacing is the largest one up to `spacing` that divides the segment, so that a segment and
+    its reverse have the same points; a segment without length gives its one place twice.
+
+    Args:
+        segments: (L, 2, D).
+        spacing: in the unit of the segments.
+
+    Returns:
+        (P, D) points, and (P,) the segment of each.
+    """
+    # A millionth of a step is rounding, not another sample.
+    steps = np.maximum(np.ceil(length(segments) / spacing - 1e-6), 1.0)
+    counts = steps.astype(np.int64) + 1
+    segment = np.repeat(np.arange(len(segments)), counts)
+    first = np.cumsum(counts) - counts
+    fraction = ((np.arange(len(segment)) - first[segment]) / steps[segment])[:, None]
+    start, end = segments[segment, 0], segments[segment, 1]
+    return np.asarray((1.0 - fraction) * start + fraction * end), segment
 
 
 def left_normal(segments_px: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from importlib.metadata import version
 
 from roel_service import __version__
 from roel_service.config.load import to_tables, to_toml
-from roel_service.config.stages import Config, RuntimeConfig
+from roel_service.config.stages import Config, RegisterConfig, RuntimeConfig
 from roel_service.errors import NoAnswerError
 from roel_service.jobs.inputs import BuildParameters
 from roel_service.mapping.pipeline import build_line_map
@@ -109,9 +109,9 @@ def build_map(
 
 
 def config_digest(config: Config) -> str:
-    """Digest of every parameter that can change a result; the number of workers cannot."""
+    """Digest of every parameter that can change a map; the number of workers cannot."""
     runtime = RuntimeConfig(seed=config.runtime.seed)
-    text = to_toml(dataclasses.replace(config, runtime=runtime))
+    text = to_toml(dataclasses.replace(config, runtime=runtime, register=RegisterConfig()))
     return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
 
 

@@ -48,3 +48,18 @@ class TriangleMesh:
 
     def __len__(self) -> int:
         return len(self.triangles)
+
+    def sampled(self, count: int, rng: np.random.Generator) -> PointCloud:
+        """`count` points, spread evenly over the surface, with the normals of their triangles."""
+        corners = self.triangles.astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        double_area = np.linalg.norm(cross, axis=1)
+        # Stratified: a point in each of `count` equal parts of the area, so that none stays bare.
+        places = (np.arange(count) + rng.random(count)) / count * double_area.sum()
+        triangle = np.searchsorted(np.cumsum(double_area), places).clip(max=len(self) - 1)
+        u, v = rng.random((2, count, 1))
+        folded = u + v > 1.0
+        u, v = np.where(folded, 1.0 - u, u), np.where(folded, 1.0 - v, v)
+        a, b, c = corners[triangle].transpose(1, 0, 2)
+        normals = cross[triangle] / double_area[triangle, None]
+        return PointCloud(points=a + u * (b - a) + v * (c - a), normals=normals)

@@ -5,6 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
+
+from roel_service.arrays import FloatArray, frozen_array
+from roel_service.geometry.se3 import SE3
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
 
@@ -64,3 +68,70 @@ class MappingResult:
     line_map: LineMap
     trajectory: Trajectory
     report: MappingReport
+
+
+class Verdict(Enum):
+    """Whether a registration may be relied on."""
+
+    ACCEPTED = "ACCEPTED"
+    AMBIGUOUS = "AMBIGUOUS"  # another transform fits about as well
+    REJECTED = "REJECTED"  # the two sides do not fit
+
+
+class StopReason(Enum):
+    """Why a registration came to its end."""
+
+    CONVERGED = "CONVERGED"
+    ITERATION_LIMIT = "ITERATION_LIMIT"
+    NO_OVERLAP = "NO_OVERLAP"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Alternative:
+    """Another transform that fits, and how well it does."""
+
+    T_target_source: SE3
+    score: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RegistrationResult:
+    """Where a map lies in another map: `p_target = scale * T.rotation @ p_source + T.translation`.
+
+    Attributes:
+        T_target_source: the transform.
+        scale: 1 unless it was asked for.
+        stop_reason: why the iterations ended.
+        verdict: whether the transform may be relied on.
+        fitness: share of the source's samples with something of the target near by, 0 to 1.
+        overlap: share of the target around the source that the source explains, 0 to 1.
+        inlier_rmse_m: of those samples; None without any.
+        information: (6, 6) inverse covariance of (r, d), target frame; None without a fit.
+        weak_directions: (K, 6) unit tangents along which the transform is hardly held, with one
+            radian weighted as the size of the source.
+        alternatives: other transforms that fit about as well, best first.
+        iteration_count: of all levels together; None where the method does not tell.
+    """
+
+    T_target_source: SE3
+    scale: float = 1.0
+    stop_reason: StopReason
+    verdict: Verdict
+    fitness: float
+    overlap: float
+    inlier_rmse_m: float | None
+    information: FloatArray | None
+    weak_directions: FloatArray
+    alternatives: tuple[Alternative, ...] = ()
+    iteration_count: int | None
+
+    def __post_init__(self) -> None:
+        weak = frozen_array(self.weak_directions, np.float64, (None, 6), "weak_directions")
+        object.__setattr__(self, "weak_directions", weak)
+        if self.information is not None:
+            information = frozen_array(self.information, np.float64, (6, 6), "information")
+            object.__setattr__(self, "information", information)
+
+    @property
+    def converged(self) -> bool:
+        return self.stop_reason is StopReason.CONVERGED

@@ -1,11 +1,12 @@
 import logging
+import struct
 
 import numpy as np
 import pytest
 import trimesh
 
 from roel_service.errors import CloudError, InputError, MeshError
-from roel_service.io.clouds import read_mesh, read_points, write_npz
+from roel_service.io.clouds import read_cloud, read_mesh, read_points, write_npz
 
 
 @pytest.fixture
@@ -109,3 +110,77 @@ def test_other_files_are_refused(tmp_path, content):
         read_mesh(tmp_path / "a")
     with pytest.raises(InputError):
         read_points(tmp_path / "a", "points")
+
+
+SCATTER = np.random.default_rng(2).normal(size=(150, 3)).astype(np.float32)
+
+
+def test_clouds_as_text_with_or_without_names_and_commas(tmp_path):
+    np.savetxt(tmp_path / "a.xyz", SCATTER)
+    np.savetxt(
+        tmp_path / "b.csv",
+        np.c_[SCATTER, SCATTER],
+        delimiter=",",
+        header="x,y,z,a,b,c",
+        comments="",
+    )
+    for name in ("a.xyz", "b.csv"):
+        np.testing.assert_array_equal(read_cloud(tmp_path / name).points, SCATTER)
+
+
+def test_clouds_as_pcd_ply_and_npz_whatever_their_names(tmp_path):
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 150\nHEIGHT 1\nDATA binary\n"
+    (tmp_path / "a").write_bytes(head.encode() + SCATTER.tobytes())
+    (tmp_path / "b").write_bytes(trimesh.PointCloud(SCATTER).export(file_type="ply"))
+    write_npz(tmp_path / "c", points=SCATTER)
+    for name in "abc":
+        np.testing.assert_array_equal(read_cloud(tmp_path / name).points, SCATTER)
+
+
+def las_file(points, *, scale=0.001, format_=0):
+    header = bytearray(227)
+    header[:4] = b"LASF"
+    struct.pack_into("<I", header, 96, 227)
+    struct.pack_into("<BHI", header, 104, format_, 20, len(points))
+    struct.pack_into("<6d", header, 131, scale, scale, scale, 1.0, 2.0, 3.0)
+    rows = np.zeros((len(points), 5), "<i4")
+    rows[:, :3] = np.rint((points - [1, 2, 3]) / scale)
+    return bytes(header) + rows.tobytes()
+
+
+def test_clouds_as_las(tmp_path):
+    (tmp_path / "a.las").write_bytes(las_file(SCATTER))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.las").points, SCATTER, atol=0.0006)
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (las_file(SCATTER)[:-1], "150 points in 3226 bytes"),
+        (las_file(SCATTER, format_=0x83), "compressed points (LAZ)"),
+        (las_file(SCATTER)[:100], "100 bytes"),
+        (las_file(SCATTER + np.array([5e5, 0, 0])), "points within 20000 m of the origin"),
+        (b"no cloud at all\n", "PLY, PCD, LAS, NPZ, mesh or text"),
+        (b"1 2\n3 4\n", "at least the columns x y z"),
+        (b"", "no numbers"),
+        (b"1 2 3\n4 5 6\n7 8 9\n", "at least 100 finite points, found 3"),
+        (b"OFF\n1 0 0\n0 0 0\n", "a mesh"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path, data, found):
+    (tmp_path / "c").write_bytes(data)
+    with pytest.raises(CloudError) as caught:
+        read_cloud(tmp_path / "c")
+    assert found in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["ply", "obj", "off", "stl", "stl_ascii", "glb"])
+def test_meshes_are_sampled_evenly(tmp_path, kind):
+    box = trimesh.creation.box(extents=(1, 1, 3))
+    data = box.export(file_type=kind)
+    (tmp_path / "mesh").write_bytes(data.encode() if isinstance(data, str) else data)
+    cloud = read_cloud(tmp_path / "mesh")
+    on_cap = np.abs(cloud.points[:, 2]).round(5) == 1.5
+    assert on_cap.mean() == pytest.approx(2 / 14, abs=1e-3)
+    np.testing.assert_allclose(np.abs(cloud.points / [0.5, 0.5, 1.5]).max(axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.abs(cloud.normals[on_cap, 2]).mean(), 1.0, atol=1e-3)

@@ -11,7 +11,17 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 
-from roel_client.cli import bench, configuration, demo, evaluate, health, maps, serve, simulate
+from roel_client.cli import (
+    bench,
+    configuration,
+    demo,
+    evaluate,
+    health,
+    maps,
+    register,
+    serve,
+    simulate,
+)
 from roel_client.cli.output import (
     LogHandler,
     logging_to_stderr,
@@ -125,7 +135,7 @@ def parser() -> Parser:
     top = Parser(prog="roel", description="3D line maps from event cameras.")
     top.add_argument("--version", action="version", version=f"roel {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
-    for group in (maps, evaluate, simulate, bench, configuration, serve, health, demo):
+    for group in (maps, register, evaluate, simulate, bench, configuration, serve, health, demo):
         group.add_commands(subparsers)
     return top
 
