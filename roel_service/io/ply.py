@@ -168,6 +168,8 @@ def _row_type(data: memoryview, element: _Element, byte_order: str) -> np.dtype[
         fields.append((f"length of {column.name}", byte_order + column.length_type))
         before = np.dtype(fields).itemsize
         length_bytes = np.dtype(column.length_type).itemsize
+        if len(data) < before:
+            raise ValueError(f"a list {column.name} in {len(data)} bytes")
         length = np.frombuffer(data[before - length_bytes : before], fields[-1][1])[0]
         if not 0 <= length * np.dtype(item).itemsize <= len(data):
             raise ValueError(f"a list {column.name} of {length} in {len(data)} bytes")
