@@ -375,8 +375,6 @@ class RegisterConfig(Stage, table="register"):
         sample_spacing_m: spacing of the points along lines of method `point`.
         point_gate_m: pairs of method `point` farther apart than this do not count.
         point_iteration_count: at most so many iterations of method `point`.
-        estimate_scale: whether the map's unit is unknown, as that of poses from one camera is.
-        gravity_aligned: whether z is vertical on both sides; `global` then looks for a heading only.
         min_fitness: a smaller share of fitting samples is no registration.
     """
 
@@ -385,8 +383,6 @@ class RegisterConfig(Stage, table="register"):
     sample_spacing_m: float = parameter(0.005, POSITIVE)
     point_gate_m: float = parameter(0.5, POSITIVE)
     point_iteration_count: int = parameter(100, UP_TO_1000)
-    estimate_scale: bool = False
-    gravity_aligned: bool = True
     min_fitness: float = parameter(0.5, SHARE)
 
 
