@@ -1,91 +1,85 @@
-"""What a child runs, and what it says while it runs."""
+"""What an executor is asked to run, and what it hears of it."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import pkgutil
-import signal
-import threading
-import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from roel_service.errors import RoelError
-from roel_service.progress import Progress, ProgressCallback
+from roel_service.progress import Progress
 
-# A stage that just began is told at once; within a stage this often is enough for a reader.
-PROGRESS_INTERVAL_S = 0.25
+GIB = 2**30
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What one attempt may use.
+
+    Attributes:
+        memory_bytes: resident memory, without files that are only mapped.
+        time_s: wall clock.
+    """
+
+    memory_bytes: int = 2 * GIB
+    time_s: float = 3600.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class TaskSpec:
-    """Work for a child.
+    """Work for an executor.
 
     Attributes:
-        entrypoint: `module:function`, imported in the child alone; it is called with the
-            parameters and a progress callback.
+        entrypoint: `module:function`, imported where it runs alone; it is called with the
+            parameters and a `Tell`.
         parameters: anything that can be pickled; inputs are named by files that never change.
     """
 
     entrypoint: str
     parameters: Any
+    limits: Limits = Limits()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Done:
-    """The last message of a child that succeeded."""
+class Partial:
+    """A result that can be used before the last one."""
 
     result: Any
 
 
-# A child sends progress, then at most one of the others.
-Message = Progress | Done | RoelError
+@dataclass(frozen=True, kw_only=True)
+class Usage:
+    """What an attempt has used so far."""
+
+    cpu_s: float
+    peak_rss_mib: float
 
 
-def run_task(spec: TaskSpec, pipe: Connection) -> None:
-    """Body of a child: run the work, tell its outcome.
+@dataclass(frozen=True, kw_only=True)
+class Done:
+    """The last message of work that succeeded."""
 
-    Any exception but a `RoelError` is a bug: the interpreter prints it and exits with code 1.
+    result: Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failed:
+    """The last message of work with a bug.
+
+    Attributes:
+        fingerprint: equal for equal failures: kind and place, not the text.
+        traceback: for the log.
     """
-    # Ctrl-C reaches the whole process group; the front alone decides what it means. SIGTERM keeps
-    # its default action, because a Python handler would wait for native code to return.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _end_with_parent()
-    work: Callable[[Any, ProgressCallback], Any] = pkgutil.resolve_name(spec.entrypoint)
-    try:
-        pipe.send(Done(result=work(spec.parameters, _Reporter(pipe))))
-    except RoelError as error:
-        pipe.send(error)
+
+    fingerprint: str
+    traceback: str
 
 
-class _Reporter:
-    """Progress callback that sends what is worth sending."""
+# What work says while it runs; called often and cheaply.
+Tell = Callable[[Progress | Partial], None]
 
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe = pipe
-        self._stage = ""
-        self._next_s = 0.0
+# Told while work runs, then one of the others ends it.
+News = Progress | Partial | Usage
+Message = News | Done | Failed | RoelError
 
-    def __call__(self, progress: Progress) -> None:
-        now_s = time.monotonic()
-        if progress.stage == self._stage and now_s < self._next_s:
-            return
-        self._stage = progress.stage
-        self._next_s = now_s + PROGRESS_INTERVAL_S
-        self._pipe.send(progress)
-
-
-def _end_with_parent() -> None:
-    """A front that was killed must not leave children behind."""
-    parent = multiprocessing.parent_process()
-    if parent is None:
-        raise RuntimeError("run_task is the body of a child process")
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+OnNews = Callable[[News], Awaitable[None]]

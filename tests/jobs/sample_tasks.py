@@ -2,12 +2,13 @@
 
 import os
 import signal
+import threading
 import time
 from pathlib import Path
 
 from roel_service.errors import EventsError
+from roel_service.jobs.task import Partial
 from roel_service.progress import Progress
-from roel_service.store.builds import BuiltVersion
 
 
 def step(stage, done_count=0):
@@ -25,7 +26,45 @@ def refuse(parameters, progress):
 
 
 def fail(parameters, progress):
-    raise ZeroDivisionError("a bug")
+    raise ZeroDivisionError("a bug", parameters)
+
+
+def fail_elsewhere(parameters, progress):
+    raise ZeroDivisionError("a bug", parameters)
+
+
+def tell_half(parameters, tell):
+    tell(Partial(result=parameters // 2))
+    return parameters
+
+
+def tell_environment(parameters, tell):
+    return os.getpid(), os.environ.get(parameters)
+
+
+def tell_thread(parameters, tell):
+    return threading.get_ident()
+
+
+def tick(parameters, tell):
+    """Adds to a file and tells so, for a minute."""
+    with Path(parameters).open("ab", buffering=0) as file:
+        for count in range(6000):
+            tell(step("tick", count))
+            file.write(b".")
+            time.sleep(0.01)
+
+
+def fill_memory(parameters, tell):
+    """Touches some MiB, a little at a time."""
+    held = []
+    for _ in range(parameters):
+        held.append(bytearray(2**20))
+        time.sleep(0.001)
+
+
+def allocate_at_once(parameters, tell):
+    return len(bytearray(parameters * 2**20))
 
 
 def sleep(parameters, progress):
@@ -46,7 +85,7 @@ def tell_pid(parameters, progress):
 
 def die(parameters, progress):
     progress(step("die"))
-    os.kill(os.getpid(), signal.SIGKILL)
+    os.kill(os.getpid(), signal.Signals[parameters or "SIGKILL"])
 
 
 def chatter(parameters, progress):
@@ -61,4 +100,6 @@ def return_big(parameters, progress):
 
 
 def build_nothing(parameters, progress):
+    from roel_service.store.builds import BuiltVersion
+
     return BuiltVersion(rlm_bytes=b"map", line_count=0, bounds_m=[0.0] * 6, report={})

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from roel_service.errors import EventsError, RoelError, UnavailableError
-from roel_service.jobs.supervisor import run_in_child
+from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.task import TaskSpec
 
 
@@ -20,10 +19,10 @@ async def run(name, parameters=None):
     """Result and stages of one task."""
     stages = []
 
-    async def note(progress):
-        stages.append(progress.stage)
+    async def note(news):
+        stages.append(news.stage)
 
-    return await run_in_child(spec(name, parameters), note), stages
+    return await ProcessExecutor(1).run(spec(name, parameters), note), stages
 
 
 def is_alive(pid):
@@ -32,10 +31,6 @@ def is_alive(pid):
     except ProcessLookupError:
         return False
     return True
-
-
-def test_a_child_returns_its_result_after_its_progress():
-    assert asyncio.run(run("double", 21)) == (42, ["first", "second"])
 
 
 def test_a_result_larger_than_any_pipe_buffer_arrives():
@@ -50,33 +45,6 @@ def test_progress_is_thinned_but_every_stage_is_told():
     assert len(stages) < 100
 
 
-def test_an_error_of_the_work_arrives_as_it_was_raised():
-    with pytest.raises(EventsError, match="walk: expected events, found none") as caught:
-        asyncio.run(run("refuse", "walk"))
-    assert caught.value.reason == "NO_EVENTS"
-
-
-def test_a_bug_is_internal_and_its_traceback_stays_in_the_log(capfd):
-    with pytest.raises(RoelError) as caught:
-        asyncio.run(run("fail"))
-    assert type(caught.value) is RoelError
-    assert caught.value.reason == "INTERNAL"
-    assert "ZeroDivisionError" not in str(caught.value)
-    assert "ZeroDivisionError: a bug" in capfd.readouterr().err
-
-
-def test_an_unknown_entry_point_is_internal(capfd):
-    with pytest.raises(RoelError, match="code 1"):
-        asyncio.run(run("no_such_function"))
-    assert "no_such_function" in capfd.readouterr().err
-
-
-def test_a_killed_child_is_a_lost_worker():
-    with pytest.raises(UnavailableError, match="SIGKILL") as caught:
-        asyncio.run(run("die"))
-    assert caught.value.reason == "WORKER_LOST"
-
-
 @pytest.mark.parametrize("name", ["sleep", "hold_on"])
 def test_cancelling_ends_the_child(name):
     async def cancel_when_it_sleeps():
@@ -85,7 +53,7 @@ def test_cancelling_ends_the_child(name):
         async def note(progress):
             started.set()
 
-        task = asyncio.create_task(run_in_child(spec(name), note))
+        task = asyncio.create_task(ProcessExecutor(1).run(spec(name), note))
         await started.wait()
         task.cancel()
         await task
@@ -96,7 +64,7 @@ def test_cancelling_ends_the_child(name):
 
 FRONT = """
 import asyncio, sys
-from roel_service.jobs.supervisor import run_in_child
+from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.task import TaskSpec
 
 async def note(progress):
@@ -104,7 +72,7 @@ async def note(progress):
 
 if __name__ == "__main__":
     spec = TaskSpec(entrypoint="sample_tasks:tell_pid", parameters=sys.argv[1])
-    asyncio.run(run_in_child(spec, note))
+    asyncio.run(ProcessExecutor(1).run(spec, note))
 """
 
 

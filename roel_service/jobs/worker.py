@@ -1,0 +1,109 @@
+"""The inside of a child: it runs the tasks that arrive and says how they go."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pkgutil
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from roel_service.errors import LimitError, RoelError
+from roel_service.jobs import memory
+from roel_service.jobs.faults import fingerprint_of
+from roel_service.jobs.task import Done, Failed, Limits, Message, Partial, TaskSpec, Tell
+from roel_service.progress import Progress
+
+# A stage that just began is told at once; within a stage this often is enough for a reader.
+PROGRESS_INTERVAL_S = 0.25
+
+# The work has threads of its own; libraries that start more only get into each other's way.
+LIBRARY_THREADS = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+)
+
+
+def serve(pipe: Connection, preload: str) -> None:
+    """Body of a child: run each task that arrives, until nobody can send any more.
+
+    Args:
+        pipe: tasks come in, messages go out; closed by the front.
+        preload: module that the tasks will need, or nothing.
+    """
+    # Ctrl-C reaches the whole process group; the front alone decides what it means. SIGTERM keeps
+    # its default action, because a Python handler would wait for native code to return.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_parent()
+    os.environ.update(dict.fromkeys(LIBRARY_THREADS, "1"))
+    memory.volunteer()
+    if preload:
+        pkgutil.resolve_name(preload)
+    while (spec := received(pipe)) is not None:
+        with memory.reserving_at_most(spec.limits.memory_bytes):
+            message = last_message(spec, thinned(pipe.send))
+        pipe.send(message)
+
+
+def received(pipe: Connection) -> Any:
+    """What comes next; None when the other end is gone."""
+    try:
+        return pipe.recv()
+    except (EOFError, OSError):
+        return None
+
+
+def last_message(spec: TaskSpec, tell: Tell) -> Message:
+    """Run the work to its end, whatever that is."""
+    try:
+        work: Callable[[Any, Tell], Any] = pkgutil.resolve_name(spec.entrypoint)
+        return Done(result=work(spec.parameters, tell))
+    except RoelError as error:
+        return error
+    except MemoryError:
+        return out_of_memory(spec.limits, "a larger allocation")
+    except Exception as error:  # the border of the work: whatever is left is a bug
+        return Failed(fingerprint=fingerprint_of(error), traceback=traceback.format_exc())
+
+
+def out_of_memory(limits: Limits, found: str) -> LimitError:
+    """The error for work that needs more memory than it may have."""
+    expected = f"at most {limits.memory_bytes // 2**20} MiB of memory"
+    return LimitError("task", expected, found, reason="TASK_OUT_OF_MEMORY")
+
+
+def thinned(send: Callable[[Message], None]) -> Tell:
+    """Pass on what is worth telling: every stage, and within a stage now and then."""
+    stage, next_s = "", 0.0
+
+    def tell(news: Progress | Partial) -> None:
+        nonlocal stage, next_s
+        if isinstance(news, Progress):
+            now_s = time.monotonic()
+            if news.stage == stage and now_s < next_s:
+                return
+            stage, next_s = news.stage, now_s + PROGRESS_INTERVAL_S
+        send(news)
+
+    return tell
+
+
+def _end_with_parent() -> None:
+    """A front that was killed must not leave children behind."""
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        raise RuntimeError("this is the body of a child process")
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
