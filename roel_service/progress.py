@@ -14,12 +14,14 @@ class Progress:
         stage: name of the stage, as in the configuration and the report.
         done_count, total_count: units of work; total_count is 0 while it is unknown.
         fraction: share of the whole job that is done, 0 to 1.
+        cached_count: units of work that an earlier job had done.
     """
 
     stage: str
     done_count: int
     total_count: int
     fraction: float
+    cached_count: int = 0
 
 
 # Called often and cheaply; raises `Cancelled` to stop the algorithm.

@@ -126,7 +126,7 @@ _ROWS = (
     Reason(
         "WORKER_LOST",
         UnavailableError,
-        "a build whose process was killed, or whose server was",
+        "work whose process was killed, or whose server was, in all attempts",
         retry_after_s=1.0,
     ),
     Reason(
@@ -134,6 +134,10 @@ _ROWS = (
         UnimplementedError,
         "a method that the protocol has and this server does not; GetCapabilities lists them",
     ),
+        "TASK_OUT_OF_MEMORY", LimitError, "work that needs more memory than the server lets it have"
+    ),
+    Reason("TASK_TIME_LIMIT", LimitError, "work that takes longer than the server lets it"),
+    Reason("LEASE_LOST", ConflictError, "the end of an attempt whose task somebody else took"),
     Reason(
         "BLOB_CORRUPT",
         CorruptionError,
@@ -144,6 +148,7 @@ _ROWS = (
         RoelError,
         "a fault of the program; the message names the entry in the server's log",
     ),
+    Reason("POISONED", RoelError, "work that failed twice with the same fault of the program"),
 )
 
 REASONS = MappingProxyType({row.name: row for row in _ROWS})

@@ -26,7 +26,7 @@ class Executor(Protocol):
 
         Raises:
             RoelError: what the work raised.
-            Fault: it raised anything else.
+            FaultError: it raised anything else.
         """
         ...
 

@@ -12,7 +12,7 @@ from roel_service.errors import RoelError
 logger = logging.getLogger(__name__)
 
 
-class Fault(RoelError):
+class FaultError(RoelError):
     """A bug of the work, which is in the log.
 
     Attributes:
@@ -24,14 +24,14 @@ class Fault(RoelError):
         self.fingerprint = fingerprint
 
 
-def logged_fault(error: BaseException, where: str) -> Fault:
+def logged_fault(error: BaseException, where: str) -> FaultError:
     """Log an exception that is no `RoelError` with its traceback; the error to answer with."""
     fault_id = _new_id()
     logger.error("fault %s in %s", fault_id, where, exc_info=error)
     return _fault(fault_id, fingerprint_of(error))
 
 
-def logged_failure(details: str, fingerprint: str, where: str) -> Fault:
+def logged_failure(details: str, fingerprint: str, where: str) -> FaultError:
     """The same for a failure in another process, of which only a text is left."""
     fault_id = _new_id()
     logger.error("fault %s in %s\n%s", fault_id, where, details)
@@ -49,5 +49,5 @@ def _new_id() -> str:
     return uuid.uuid4().hex[:12]
 
 
-def _fault(fault_id: str, fingerprint: str) -> Fault:
-    return Fault(f"a fault of the program, logged as {fault_id}", fingerprint)
+def _fault(fault_id: str, fingerprint: str) -> FaultError:
+    return FaultError(f"a fault of the program, logged as {fault_id}", fingerprint)

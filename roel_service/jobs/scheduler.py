@@ -1,27 +1,73 @@
-"""Builds in turn: a bounded queue, a bounded number of children, every step on record."""
+"""Operations in turn: tasks are taken from their rows, run, and ended there."""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable
-from functools import partial
+import uuid
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any
 
-from roel_service.errors import LimitError, RoelError, UnavailableError
+from roel_service.errors import ConflictError, LimitError, RoelError, UnavailableError
+from roel_service.jobs.executors import Executor
 from roel_service.jobs.faults import logged_fault
-from roel_service.jobs.supervisor import run_in_child
-from roel_service.jobs.task import TaskSpec
+from roel_service.jobs.metadata import Metadata
+from roel_service.jobs.preparation import Prepare
+from roel_service.jobs.retries import MAX_ATTEMPT_COUNT, Retry, judge
+from roel_service.jobs.task import GIB, Limits, News, Partial, TaskSpec, Usage
 from roel_service.progress import Progress
 from roel_service.store.operations import Operations
-from roel_service.store.records import OperationRecord
+from roel_service.store.records import (
+    OperationMethod,
+    OperationRecord,
+    TaskRecord,
+    now_us,
+)
+from roel_service.store.tasks import Tasks
 from roel_service.wire.errors import status_from_error
 
 logger = logging.getLogger(__name__)
 
 STARTING = Progress(stage="", done_count=0, total_count=0, fraction=0.0)
 
-# What becomes a build's operation and work once it is admitted; called in a thread.
-BeginBuild = Callable[[], tuple[OperationRecord, TaskSpec]]
+# A lease is held for 30 s: two renewals may fail before it is lost.
+RENEWAL_INTERVAL_S = 10.0
+# Whatever happens is noticed at once; only the time until a retry passes without a notice.
+POLL_INTERVAL_S = 0.5
+
+# Makes the rows of an operation once it is admitted; called in a thread.
+Begin = Callable[[], OperationRecord]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Policy:
+    """What operations may use.
+
+    Attributes:
+        unfinished_count: operations that may be queued or running.
+        memory_bytes, max_memory_bytes: limit of a first attempt, and of one that is retried
+            because that was too little.
+        time_s: wall clock of an attempt.
+        retry_delay_s: mean delay of the second attempt.
+    """
+
+    unfinished_count: int
+    memory_bytes: int = 2 * GIB
+    max_memory_bytes: int = 4 * GIB
+    time_s: float = 3600.0
+    retry_delay_s: float = 1.0
+
+    def limits(self, task: TaskRecord) -> Limits:
+        """Those of the next attempt."""
+        memory_bytes = min(self.memory_bytes << task.memory_doublings, self.max_memory_bytes)
+        return Limits(memory_bytes=memory_bytes, time_s=self.time_s)
+
+    @property
+    def max_memory_doublings(self) -> int:
+        """How often the memory limit can be doubled."""
+        return max(0, (self.max_memory_bytes // self.memory_bytes).bit_length() - 1)
 
 
 class Changes:
@@ -41,24 +87,47 @@ class Changes:
 
 
 class Scheduler:
-    """Runs builds in children and keeps their operations true.
+    """Runs tasks and keeps their operations true; the rows decide, whoever wrote them.
 
     Args:
-        operations: where they live.
-        concurrent_count: children at a time.
-        queued_count: builds that may wait for a child.
+        operations, tasks: where they live.
+        executor: where tasks run.
+        prepare: what the tasks of each method are to do.
+        policy: what they may use.
     """
 
-    def __init__(self, operations: Operations, concurrent_count: int, queued_count: int) -> None:
+    def __init__(
+        self,
+        operations: Operations,
+        tasks: Tasks,
+        executor: Executor,
+        prepare: Mapping[OperationMethod, Prepare],
+        policy: Policy,
+    ) -> None:
         self._operations = operations
-        self._children = asyncio.Semaphore(concurrent_count)
-        self._free_count = concurrent_count + queued_count
-        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._tasks = tasks
+        self._executor = executor
+        self._prepare = prepare
+        self._policy = policy
+        self._owner = uuid.uuid4().hex
+        self._attempts: dict[str, tuple[TaskRecord, asyncio.Task[None]]] = {}
+        self._loops: list[asyncio.Task[None]] = []
+        self._admission = asyncio.Lock()
+        self._work = asyncio.Event()
         self._draining = False
         self.changes = Changes()
 
-    async def submit(self, begin: BeginBuild) -> OperationRecord:
-        """Admit a build.
+    async def start(self) -> None:
+        """Take up what a server before this one left behind, then whatever comes."""
+        await asyncio.to_thread(self._tasks.expire_leases)
+        found = "one that an older release left behind"
+        error = UnavailableError("task", "a worker that finishes", found, reason="WORKER_LOST")
+        for operation_id in await asyncio.to_thread(self._operations.without_task):
+            await asyncio.to_thread(self._operations.abandon, operation_id, _encoded(error))
+        self._loops = [asyncio.create_task(loop()) for loop in (self._take_tasks, self._renew)]
+
+    async def submit(self, begin: Begin) -> OperationRecord:
+        """Admit an operation.
 
         Raises:
             LimitError: QUEUE_FULL.
@@ -68,74 +137,145 @@ class Scheduler:
         if self._draining:
             reason = "DRAINING"
             raise UnavailableError("server", "one that takes work", "one that ends", reason=reason)
-        if self._free_count == 0:
-            raise LimitError("build", "room in the queue", "a full one", reason="QUEUE_FULL")
-        self._free_count -= 1
-        # The row must not be left without a task when the caller goes away meanwhile.
-        return await asyncio.shield(self._begin(begin))
+        # The operation must be announced although the caller goes away meanwhile.
+        return await asyncio.shield(self._admit(begin))
 
     async def cancel(self, operation_id: str) -> None:
-        """End a build, and return when it has ended; one that is final stays as it is."""
-        task = self._tasks.get(operation_id)
-        if task is not None:
-            task.cancel()
-            await asyncio.wait({task})
+        """End an operation, and return when nothing of it runs; one that has ended stays so."""
+        await asyncio.to_thread(self._operations.cancel, operation_id)
+        self.changes.announce()
+        attempts = [
+            running
+            for task, running in self._attempts.values()
+            if task.operation_id == operation_id
+        ]
+        await _ended(attempts)
 
     async def drain(self) -> None:
-        """End all builds and take no more; they fail with DRAINING."""
+        """Take no more work, and give back what is under way; the next server continues it."""
         self._draining = True
-        for operation_id in list(self._tasks):
-            await self.cancel(operation_id)
+        await _ended([*self._loops, *(running for _, running in self._attempts.values())])
 
-    async def fail_unfinished(self) -> None:
-        """Fail what a server that died left behind."""
-        found = "a server that ended during the build"
-        lost = UnavailableError("build", "a worker that finishes", found, reason="WORKER_LOST")
-        for record in await asyncio.to_thread(self._operations.unfinished):
-            await self._fail(record.id, lost)
+    async def _admit(self, begin: Begin) -> OperationRecord:
+        async with self._admission:
+            unfinished = await asyncio.to_thread(self._operations.unfinished)
+            if len(unfinished) >= self._policy.unfinished_count:
+                raise LimitError("task", "room in the queue", "a full one", reason="QUEUE_FULL")
+            record = await asyncio.to_thread(begin)
+        self._work.set()
+        return record
 
-    async def _begin(self, begin: BeginBuild) -> OperationRecord:
-        try:
-            operation, spec = await asyncio.to_thread(begin)
-        except BaseException:
-            self._free_count += 1
-            raise
-        task = asyncio.create_task(self._run(operation.id, spec))
-        self._tasks[operation.id] = task
-        task.add_done_callback(lambda _: self._forget(operation.id))
-        return operation
+    async def _take_tasks(self) -> None:
+        while True:
+            self._work.clear()
+            while len(self._attempts) < self._executor.capacity:
+                task = await asyncio.to_thread(self._tasks.lease, self._owner)
+                if task is None:
+                    break
+                self._begin_attempt(task)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(POLL_INTERVAL_S):
+                    await self._work.wait()
 
-    def _forget(self, operation_id: str) -> None:
-        del self._tasks[operation_id]
-        self._free_count += 1
+    async def _renew(self) -> None:
+        while True:
+            await asyncio.sleep(RENEWAL_INTERVAL_S)
+            held = await asyncio.to_thread(self._tasks.renew, self._owner)
+            lost = [running for key, (_, running) in self._attempts.items() if key not in held]
+            await _ended(lost)
+
+    def _begin_attempt(self, task: TaskRecord) -> None:
+        running = asyncio.create_task(self._attempt(task))
+        self._attempts[task.id] = (task, running)
+        running.add_done_callback(lambda _: self._forget(task.id))
+
+    def _forget(self, task_id: str) -> None:
+        del self._attempts[task_id]
+        self._work.set()
         self.changes.announce()
 
-    async def _run(self, operation_id: str, spec: TaskSpec) -> None:
-        """One build from its turn to its end, however it ends."""
-        advance = partial(self._record, self._operations.advance, operation_id)
+    async def _attempt(self, task: TaskRecord) -> None:
+        """One attempt, however it ends."""
         try:
-            async with self._children:
-                await advance(STARTING)
-                built = await run_in_child(spec, advance)
-            await self._record(self._operations.succeed, operation_id, built)
+            await self._record(self._operations.succeed, task.lease, await self._outcome(task))
         except asyncio.CancelledError:
-            await self._cancelled(operation_id)
+            await self._give_back(task)
         except RoelError as error:
-            await self._fail(operation_id, error)
-        except Exception as error:  # the border of the build: whatever is left is a bug
-            await self._fail(operation_id, logged_fault(error, f"operation {operation_id}"))
+            await self._settle(task, error)
+        except Exception as error:  # the border of the operation: whatever is left is a bug
+            await self._settle(task, logged_fault(error, f"operation {task.operation_id}"))
 
-    async def _cancelled(self, operation_id: str) -> None:
-        if self._draining:
-            found = "one that ends"
-            error = UnavailableError("server", "one that builds", found, reason="DRAINING")
-            await self._fail(operation_id, error)
+    async def _outcome(self, task: TaskRecord) -> Any:
+        if task.attempt_count > MAX_ATTEMPT_COUNT:
+            found = f"{MAX_ATTEMPT_COUNT} servers that ended during the work"
+            raise UnavailableError("task", "a worker that finishes", found, reason="WORKER_LOST")
+        metadata = Metadata(task.attempt_count)
+        await self._advance(task, STARTING, metadata)
+        operation = await asyncio.to_thread(self._operations.get, task.operation_id)
+        prepare = self._prepare[operation.method]
+        entrypoint, parameters = await asyncio.to_thread(prepare, operation, task)
+        limits = self._policy.limits(task)
+        spec = TaskSpec(entrypoint=entrypoint, parameters=parameters, limits=limits)
+        return await self._executor.run(spec, lambda news: self._hear(task, metadata, news))
+
+    async def _hear(self, task: TaskRecord, metadata: Metadata, news: News) -> None:
+        if isinstance(news, Usage):
+            # Told with the next progress: on its own it is not worth a write.
+            metadata.note_usage(news)
+        elif isinstance(news, Partial):
+            await self._record(self._operations.preview, task.lease, news.result)
         else:
-            await self._record(self._operations.cancel, operation_id)
+            metadata.note_progress(news)
+            await self._advance(task, news, metadata)
 
-    async def _fail(self, operation_id: str, error: RoelError) -> None:
-        status = status_from_error(error).SerializeToString(deterministic=True)
-        await self._record(self._operations.fail, operation_id, status)
+    async def _advance(self, task: TaskRecord, progress: Progress, metadata: Metadata) -> None:
+        advance = self._operations.advance
+        await self._record(advance, task.lease, progress, metadata.encoded())
+
+    async def _settle(self, task: TaskRecord, error: RoelError) -> None:
+        """Try again, or end the operation with the error."""
+        verdict = judge(
+            task,
+            error,
+            delay_s=self._policy.retry_delay_s,
+            max_memory_doublings=self._policy.max_memory_doublings,
+        )
+        if isinstance(verdict, Retry):
+            logger.warning("attempt %d of task %s: %s", task.attempt_count, task.id, error)
+            await self._end_attempt(self._requeue(task, verdict))
+        else:
+            fail = self._operations.fail
+            await self._end_attempt(self._record(fail, task.lease, _encoded(verdict)))
+
+    async def _give_back(self, task: TaskRecord) -> None:
+        """Leave the task to the next server as if this attempt had never begun."""
+        unchanged = Retry(
+            delay_s=0.0,
+            memory_doublings=task.memory_doublings,
+            failure_hash=task.failure_hash,
+        )
+        requeued = self._requeue(task, unchanged, attempt_count=task.attempt_count - 1)
+        await self._end_attempt(requeued)
+
+    async def _requeue(
+        self, task: TaskRecord, retry: Retry, attempt_count: int | None = None
+    ) -> None:
+        record = await asyncio.to_thread(
+            self._operations.requeue,
+            task.lease,
+            not_before_us=now_us() + round(1e6 * retry.delay_s),
+            attempt_count=task.attempt_count if attempt_count is None else attempt_count,
+            memory_doublings=retry.memory_doublings,
+            failure_hash=retry.failure_hash,
+        )
+        logger.info("%s %s: to be tried again", record.method.value, record.id)
+
+    async def _end_attempt(self, ending: Coroutine[Any, Any, None]) -> None:
+        """An attempt that was cancelled or replaced has no say any more."""
+        try:
+            await ending
+        except ConflictError as error:
+            logger.info("an attempt does not count: %s", error)
 
     async def _record(self, change: Callable[..., OperationRecord], *arguments: object) -> None:
         """Make a change durable, then tell whoever waits for it."""
@@ -143,3 +283,15 @@ class Scheduler:
         if record.state.is_final:
             logger.info("%s %s: %s", record.method.value, record.id, record.state.value)
         self.changes.announce()
+
+
+def _encoded(error: RoelError) -> bytes:
+    return bytes(status_from_error(error).SerializeToString(deterministic=True))
+
+
+async def _ended(running: list[asyncio.Task[None]]) -> None:
+    """Cancel, and wait until nothing runs any more."""
+    for task in running:
+        task.cancel()
+    if running:
+        await asyncio.wait(running)

@@ -76,7 +76,7 @@ class Child:
 
         Raises:
             RoelError: what the work raised.
-            Fault: it raised anything else, or crashed.
+            FaultError: it raised anything else, or crashed.
             LimitError: TASK_OUT_OF_MEMORY, TASK_TIME_LIMIT.
             UnavailableError: WORKER_LOST, the child was killed.
         """
@@ -164,7 +164,7 @@ async def last_message(
     return message
 
 
-def result_of(message: Message, spec: TaskSpec) -> Any:
+def result_of(message: Message | None, spec: TaskSpec) -> Any:
     """What the last message of work brought; raises what it tells of."""
     if isinstance(message, Done):
         return message.result

@@ -11,13 +11,12 @@ from google.longrunning import operations_pb2
 
 from roel_service.config.stages import Config
 from roel_service.errors import ConfigError
-from roel_service.jobs.inputs import BuildParameters
+from roel_service.jobs.preparation import build_parameters_to_bytes
 from roel_service.jobs.scheduler import Scheduler
-from roel_service.jobs.task import TaskSpec
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import map_to_proto, map_version_to_proto, operation_to_proto
 from roel_service.service.settings import Settings
-from roel_service.store.records import MapVersionRecord, OperationRecord
+from roel_service.store.records import MapVersionRecord
 from roel_service.store.store import Store
 from roel_service.v1 import maps_pb2
 from roel_service.wire import names
@@ -67,7 +66,9 @@ class MapServicer:
         map_id = names.map_id(request.parent)
         stream_id = names.event_stream_id(request.event_stream)
         config = _requested_config(request)
-        record = await self._scheduler.submit(partial(self._begin, map_id, stream_id, config))
+        parameters = build_parameters_to_bytes(config)
+        begin = partial(self._store.builds.begin, map_id, stream_id, parameters=parameters)
+        record = await self._scheduler.submit(begin)
         return operation_to_proto(record, None)
 
     async def GetMapVersion(
@@ -105,24 +106,6 @@ class MapServicer:
 
     def _version_page(self, map_id: str, after: str, limit: int) -> Sequence[MapVersionRecord]:
         return self._store.maps.version_page(map_id, int(after or 0), limit)
-
-    def _begin(
-        self, map_id: str, stream_id: str, config: Config
-    ) -> tuple[OperationRecord, TaskSpec]:
-        """Record the build; from then on nobody can delete its recording."""
-        operation = self._store.builds.begin(map_id, stream_id)
-        streams = self._store.event_streams
-        stream = streams.get(stream_id)
-        parameters = BuildParameters(
-            event_file=streams.event_file(stream),
-            time_range_us=(stream.start_us, stream.end_us),
-            chunk_lengths=streams.chunk_lengths(stream),
-            pose_files=streams.pose_files(stream),
-            camera=stream.camera,
-            config=config,
-        )
-        entrypoint = self._settings.build_entrypoint
-        return operation, TaskSpec(entrypoint=entrypoint, parameters=parameters)
 
 
 def _requested_config(request: maps_pb2.BuildMapRequest) -> Config:

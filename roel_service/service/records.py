@@ -35,6 +35,7 @@ _STREAM_STATES = {
 
 _VERSION_STATES = {
     VersionState.CREATING: maps_pb2.MapVersion.STATE_CREATING,
+    VersionState.PREVIEW: maps_pb2.MapVersion.STATE_PREVIEW,
     VersionState.ACTIVE: maps_pb2.MapVersion.STATE_ACTIVE,
     VersionState.FAILED: maps_pb2.MapVersion.STATE_FAILED,
 }
@@ -67,7 +68,7 @@ def map_to_proto(record: MapRecord) -> maps_pb2.Map:
 
 
 def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
-    """A version; what only an ACTIVE one has is left out of the others."""
+    """A version; what only a usable one has is left out of the others."""
     message = maps_pb2.MapVersion(
         name=names.map_version_name(record.map_id, record.version),
         state=_VERSION_STATES[record.state],
@@ -75,7 +76,7 @@ def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
         operation=names.operation_name(record.operation_id),
         create_time=_timestamp(record.create_time_us),
     )
-    if record.state is VersionState.ACTIVE:
+    if record.state.is_usable:
         blob = types_pb2.BlobRef(sha256=record.sha256, size_bytes=record.size_bytes)
         corners = np.array(record.bounds_m).reshape(2, 3)
         message.map.CopyFrom(blob)

@@ -15,10 +15,13 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from roel_service.errors import InputError, UnavailableError
-from roel_service.jobs.scheduler import Scheduler
+from roel_service.jobs.executors import ProcessExecutor
+from roel_service.jobs.preparation import build_preparation
+from roel_service.jobs.scheduler import Policy, Scheduler
 from roel_service.service.interceptors import ErrorInterceptor
 from roel_service.service.services import SERVICES, add_services
 from roel_service.service.settings import Settings
+from roel_service.store.records import OperationMethod
 from roel_service.store.store import Store
 
 logger = logging.getLogger(__name__)
@@ -54,8 +57,8 @@ async def serve(
     _check_host(host, insecure)
     stop = _stop_at_signals()
     with Store(data) as store:
-        scheduler = Scheduler(store.operations, settings.concurrent_builds, settings.queued_builds)
-        await scheduler.fail_unfinished()
+        scheduler = _scheduler(store, settings)
+        await scheduler.start()
         server = grpc.aio.server(
             interceptors=[ErrorInterceptor()], options=_options(settings), compression=None
         )
@@ -69,6 +72,23 @@ async def serve(
         await health_servicer.enter_graceful_shutdown()
         await scheduler.drain()
         await server.stop(settings.drain_grace_s)
+
+
+def _scheduler(store: Store, settings: Settings) -> Scheduler:
+    build = build_preparation(store, settings.build_entrypoint)
+    return Scheduler(
+        store.operations,
+        store.tasks,
+        ProcessExecutor(settings.concurrent_builds),
+        {OperationMethod.BUILD_MAP: build},
+        Policy(
+            unfinished_count=settings.concurrent_builds + settings.queued_builds,
+            memory_bytes=settings.task_memory_bytes,
+            max_memory_bytes=settings.retried_task_memory_bytes,
+            time_s=settings.task_time_s,
+            retry_delay_s=settings.retry_delay_s,
+        ),
+    )
 
 
 def _check_host(host: str, insecure: bool) -> None:

@@ -23,6 +23,10 @@ class Settings:
         pose_count: most poses of a recording.
         concurrent_builds: children at a time.
         queued_builds: builds that may wait for a child.
+        task_memory_bytes, retried_task_memory_bytes: resident memory of a child, and of one that
+            tries again what needed more.
+        task_time_s: wall clock of one attempt.
+        retry_delay_s: mean time before a lost or broken attempt is tried again; it doubles.
         commit_bytes: an upload is made durable at least this often.
         download_part_bytes: size of the messages of a download.
         lines_per_message: most lines of a message of GetLines.
@@ -39,6 +43,10 @@ class Settings:
     pose_count: int = 1_000_000
     concurrent_builds: int = 2
     queued_builds: int = 16
+    task_memory_bytes: int = 2 * GIB
+    retried_task_memory_bytes: int = 4 * GIB
+    task_time_s: float = 3600.0
+    retry_delay_s: float = 1.0
     commit_bytes: int = 8 * MIB
     download_part_bytes: int = MIB
     lines_per_message: int = 100_000

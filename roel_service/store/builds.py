@@ -22,6 +22,7 @@ from roel_service.store.records import (
     stored,
 )
 from roel_service.store.schema import MAP, MAP_VERSION, OPERATION
+from roel_service.store.tasks import insert_task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +47,10 @@ class Builds:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def begin(self, map_id: str, stream_id: str, request_sha256: str = "") -> OperationRecord:
-        """A new version and the operation that builds it.
+    def begin(
+        self, map_id: str, stream_id: str, request_sha256: str = "", *, parameters: bytes = b""
+    ) -> OperationRecord:
+        """A new version, the operation that builds it, and its task with these parameters.
 
         Raises:
             NotFoundError: no such map or recording.
@@ -65,6 +68,7 @@ class Builds:
                 event_stream_id=stream_id,
             )
             insert_version(connection, operation)
+            insert_task(connection, operation.id, parameters, [])
         return operation
 
 
@@ -78,21 +82,36 @@ class VersionCompletion:
         self, connection: Connection, operation: OperationRecord, outcome: BuiltVersion
     ) -> bytes:
         """Store the map file, then the row that names it; the version is the answer."""
-        # The blob comes first: a crash leaves an unused blob, never a dangling version.
-        changes = {
-            "state": VersionState.ACTIVE,
-            "sha256": self._blobs.put(outcome.rlm_bytes),
-            "size_bytes": len(outcome.rlm_bytes),
-            "line_count": outcome.line_count,
-            "bounds_m": outcome.bounds_m,
-            "report": outcome.report,
-        }
-        _change_version(connection, operation, changes)
+        self._fill(connection, operation, outcome, VersionState.ACTIVE)
         return b""
+
+    def preview(
+        self, connection: Connection, operation: OperationRecord, partial: BuiltVersion
+    ) -> None:
+        """The version can be used, as a PREVIEW."""
+        self._fill(connection, operation, partial, VersionState.PREVIEW)
 
     def fail(self, connection: Connection, operation: OperationRecord) -> None:
         """The version stays, as FAILED."""
         _change_version(connection, operation, {"state": VersionState.FAILED})
+
+    def _fill(
+        self,
+        connection: Connection,
+        operation: OperationRecord,
+        built: BuiltVersion,
+        state: VersionState,
+    ) -> None:
+        # The blob comes first: a crash leaves an unused blob, never a dangling version.
+        changes = {
+            "state": state,
+            "sha256": self._blobs.put(built.rlm_bytes),
+            "size_bytes": len(built.rlm_bytes),
+            "line_count": built.line_count,
+            "bounds_m": built.bounds_m,
+            "report": built.report,
+        }
+        _change_version(connection, operation, changes)
 
 
 def insert_version(connection: Connection, operation: OperationRecord) -> None:

@@ -83,11 +83,11 @@ class Maps:
             return [map_version_from_row(row) for row in rows.mappings()]
 
     def map_file(self, record: MapVersionRecord) -> bytes:
-        """The map file of an ACTIVE version; raises `StateError` MAP_NOT_ACTIVE."""
-        if record.state is not VersionState.ACTIVE:
+        """The map file of a usable version; raises `StateError` MAP_NOT_ACTIVE."""
+        if not record.state.is_usable:
             subject = f"{record.map_id} v{record.version}"
             found = record.state.value
-            raise StateError(subject, "an active version", found, reason="MAP_NOT_ACTIVE")
+            raise StateError(subject, "a usable version", found, reason="MAP_NOT_ACTIVE")
         return self._blobs.read(record.sha256)
 
 

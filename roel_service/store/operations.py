@@ -3,38 +3,46 @@
 A new method takes four steps:
 
 1. A member of `OperationMethod`, named like the method of the service.
-2. A function that checks the request and inserts `queued_operation(...)` in the same transaction as
-   whatever the method works on; see `builds.Builds.begin`.
+2. A function that checks the request and inserts `queued_operation(...)` and its task in the same
+   transaction as whatever the method works on; see `builds.Builds.begin`.
 3. A `Completion`, entered in `store.Store`: what the end of the operation does to those rows.
-4. In `service/records.py`, the resource that the metadata name as the target, and the answer.
+4. A `Prepare`, entered in `service.server`: what a child is to do, as told by the rows.
+5. In `service/records.py`, the resource that the metadata name as the target, and the answer.
 
-The scheduler needs to know none of this: it runs the task and calls `advance`, then one of
-`succeed`, `fail` and `cancel`.
+The scheduler needs to know none of this: it takes the task and calls `advance`, then one of
+`succeed`, `fail`, `requeue` and `cancel`. All but the last name the lease of the attempt, and are
+refused with `ConflictError` LEASE_LOST when it is void.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any, Protocol
 
-from sqlalchemy import Connection, delete, select, update
+from sqlalchemy import Connection, delete, exists, select, update
 
 from roel_service.errors import NotFoundError, StateError
 from roel_service.progress import Progress
 from roel_service.store.database import Database
 from roel_service.store.records import (
     UNFINISHED,
+    Lease,
     OperationMethod,
     OperationRecord,
     OperationState,
+    TaskState,
     now_us,
     operation_from_row,
     stored,
 )
 from roel_service.store.retention import DAY_US, OPERATION_RETENTION_DAYS
-from roel_service.store.schema import OPERATION
+from roel_service.store.schema import OPERATION, TASK
+from roel_service.store.tasks import check_lease, end_task, end_tasks_of, requeue_task
+
+_UNFINISHED = OPERATION.c.state.in_([item.value for item in UNFINISHED])
 
 
 class Completion(Protocol):
@@ -42,6 +50,9 @@ class Completion(Protocol):
 
     def succeed(self, connection: Connection, operation: OperationRecord, outcome: Any) -> bytes:
         """Make the outcome of the task durable; the operation's result, empty if rows tell it."""
+
+    def preview(self, connection: Connection, operation: OperationRecord, partial: Any) -> None:
+        """Make a first result usable that the outcome will replace."""
 
     def fail(self, connection: Connection, operation: OperationRecord) -> None:
         """Undo or mark what was begun; failing and being cancelled are the same here."""
@@ -56,9 +67,7 @@ class Operations:
         self._database = database
         self._completions = completions
 
-    def advance(
-        self, operation_id: str, progress: Progress, metadata: bytes = b""
-    ) -> OperationRecord:
+    def advance(self, lease: Lease, progress: Progress, metadata: bytes = b"") -> OperationRecord:
         """Record how far an operation is; `metadata` is what else its caller can read of it."""
         changes = {
             "state": OperationState.RUNNING,
@@ -68,27 +77,61 @@ class Operations:
             "fraction": progress.fraction,
             "metadata": metadata,
         }
-        with self._database.write() as connection:
-            record = get_operation(connection, operation_id)
-            return record if record.state.is_final else _change(connection, record, changes)
+        with self._leased(lease) as (connection, record):
+            return _change(connection, record, changes)
 
-    def succeed(self, operation_id: str, outcome: Any) -> OperationRecord:
+    def preview(self, lease: Lease, partial: Any) -> OperationRecord:
+        """A first result can be used."""
+        with self._leased(lease) as (connection, record):
+            self._completions[record.method].preview(connection, record, partial)
+            return _change(connection, record, {})
+
+    def requeue(
+        self,
+        lease: Lease,
+        *,
+        not_before_us: int,
+        attempt_count: int,
+        memory_doublings: int,
+        failure_hash: str,
+    ) -> OperationRecord:
+        """The attempt came to nothing; the operation waits for the next one."""
+        changes = {
+            "not_before_us": not_before_us,
+            "attempt_count": attempt_count,
+            "memory_doublings": memory_doublings,
+            "failure_hash": failure_hash,
+        }
+        with self._leased(lease) as (connection, record):
+            requeue_task(connection, lease, changes)
+            return _change(connection, record, {"state": OperationState.QUEUED, "stage": ""})
+
+    def succeed(self, lease: Lease, outcome: Any) -> OperationRecord:
         """The operation SUCCEEDED with the outcome of its task."""
-        with self._database.write() as connection:
-            record = get_operation(connection, operation_id)
-            if record.state.is_final:
-                return record
+        with self._leased(lease) as (connection, record):
             result = self._completions[record.method].succeed(connection, record, outcome)
+            end_task(connection, lease, TaskState.DONE)
             changes = {"state": OperationState.SUCCEEDED, "fraction": 1.0, "result": result}
             return _end(connection, record, changes)
 
-    def fail(self, operation_id: str, error: bytes) -> OperationRecord:
+    def fail(self, lease: Lease, error: bytes) -> OperationRecord:
         """The operation FAILED; the caller encodes the error."""
-        return self._give_up(operation_id, {"state": OperationState.FAILED, "error": error})
+        with self._leased(lease) as (connection, record):
+            return self._give_up(connection, record, OperationState.FAILED, error)
 
     def cancel(self, operation_id: str) -> OperationRecord:
-        """The operation is CANCELLED."""
-        return self._give_up(operation_id, {"state": OperationState.CANCELLED})
+        """The operation is CANCELLED; one that has ended stays as it is."""
+        return self._end_unfinished(operation_id, OperationState.CANCELLED)
+
+    def abandon(self, operation_id: str, error: bytes) -> OperationRecord:
+        """An operation without a task FAILED; one that has ended stays as it is."""
+        return self._end_unfinished(operation_id, OperationState.FAILED, error)
+
+    def without_task(self) -> list[str]:
+        """Ids of unfinished operations that nobody will ever end."""
+        has_task = exists().where(TASK.c.operation_id == OPERATION.c.id)
+        with self._database.read() as connection:
+            return list(connection.scalars(select(OPERATION.c.id).where(_UNFINISHED, ~has_task)))
 
     def get(self, operation_id: str) -> OperationRecord:
         """One operation; raises `NotFoundError`."""
@@ -104,7 +147,7 @@ class Operations:
 
     def unfinished(self) -> list[OperationRecord]:
         """Operations that are queued or running."""
-        query = select(OPERATION).where(OPERATION.c.state.in_([item.value for item in UNFINISHED]))
+        query = select(OPERATION).where(_UNFINISHED)
         with self._database.read() as connection:
             return [operation_from_row(row) for row in connection.execute(query).mappings()]
 
@@ -124,13 +167,28 @@ class Operations:
         with self._database.write() as connection:
             connection.execute(delete(OPERATION).where(expired))
 
-    def _give_up(self, operation_id: str, changes: dict[str, Any]) -> OperationRecord:
+    @contextmanager
+    def _leased(self, lease: Lease) -> Iterator[tuple[Connection, OperationRecord]]:
+        """A transaction on the operation of a valid lease."""
+        with self._database.write() as connection:
+            check_lease(connection, lease)
+            yield connection, get_operation(connection, lease.operation_id)
+
+    def _end_unfinished(
+        self, operation_id: str, state: OperationState, error: bytes = b""
+    ) -> OperationRecord:
         with self._database.write() as connection:
             record = get_operation(connection, operation_id)
             if record.state.is_final:
                 return record
-            self._completions[record.method].fail(connection, record)
-            return _end(connection, record, changes)
+            return self._give_up(connection, record, state, error)
+
+    def _give_up(
+        self, connection: Connection, record: OperationRecord, state: OperationState, error: bytes
+    ) -> OperationRecord:
+        self._completions[record.method].fail(connection, record)
+        end_tasks_of(connection, record.id)
+        return _end(connection, record, {"state": state, "error": error})
 
 
 def queued_operation(

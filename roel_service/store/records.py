@@ -25,8 +25,13 @@ class VersionState(Enum):
     """Life of a map version."""
 
     CREATING = "creating"
+    PREVIEW = "preview"
     ACTIVE = "active"
     FAILED = "failed"
+
+    @property
+    def is_usable(self) -> bool:
+        return self in (VersionState.PREVIEW, VersionState.ACTIVE)
 
 
 class OperationMethod(Enum):
@@ -145,6 +150,57 @@ class OperationRecord:
     expire_time_us: int
 
 
+class TaskState(Enum):
+    """Life of a task; DONE and FAILED are its ends."""
+
+    READY = "ready"
+    LEASED = "leased"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lease:
+    """The right to end an attempt; void as soon as a task has another fence."""
+
+    task_id: str
+    operation_id: str
+    fence: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskRecord:
+    """The work of an operation.
+
+    Attributes:
+        parameters: what the work needs to know, as the caller of the store encoded it.
+        inputs: digests of blobs that must stay until the task has ended.
+        attempt_count: attempts begun.
+        memory_doublings: how often its memory limit was doubled, because it was too small.
+        failure_hash: fingerprint of the last failure that may pass; empty if there was none.
+        not_before_us: when it may be leased.
+        lease_owner, lease_until_us: who works on it, and until when that is believed.
+        fence: grows with every lease.
+    """
+
+    id: str
+    operation_id: str
+    state: TaskState
+    parameters: bytes
+    inputs: list[str]
+    attempt_count: int
+    memory_doublings: int
+    failure_hash: str
+    not_before_us: int
+    lease_owner: str
+    lease_until_us: int
+    fence: int
+
+    @property
+    def lease(self) -> Lease:
+        return Lease(task_id=self.id, operation_id=self.operation_id, fence=self.fence)
+
+
 def now_us() -> int:
     """Microseconds since 1970 (UTC)."""
     return time.time_ns() // 1000
@@ -181,6 +237,12 @@ def operation_from_row(row: RowMapping) -> OperationRecord:
     """The inverse of `row_from_record`."""
     states = {"state": OperationState(row["state"]), "method": OperationMethod(row["method"])}
     return OperationRecord(**{**row, **states})
+
+
+def task_from_row(row: RowMapping) -> TaskRecord:
+    """The inverse of `row_from_record`."""
+    parsed = {"state": TaskState(row["state"]), "inputs": json.loads(row["inputs"])}
+    return TaskRecord(**{**row, **parsed})
 
 
 def _stored(value: Any) -> Any:

@@ -106,5 +106,24 @@ OPERATION = Table(
     Column("expire_time_us", BigInteger, nullable=False),
 )
 
+TASK = Table(
+    "task",
+    METADATA,
+    Column("id", String, primary_key=True),
+    Column("operation_id", ForeignKey("operation.id", ondelete="CASCADE"), nullable=False),
+    Column("state", String, nullable=False),
+    Column("parameters", LargeBinary, nullable=False),
+    Column("inputs", String, nullable=False),
+    Column("attempt_count", Integer, nullable=False),
+    Column("memory_doublings", Integer, nullable=False),
+    Column("failure_hash", String, nullable=False),
+    Column("not_before_us", BigInteger, nullable=False),
+    Column("lease_owner", String, nullable=False),
+    Column("lease_until_us", BigInteger, nullable=False),
+    Column("fence", BigInteger, nullable=False),
+)
+
+Index("task_operation", TASK.c.operation_id)
+Index("task_state", TASK.c.state, TASK.c.not_before_us)
 Index("operation_state", OPERATION.c.state)
 Index("operation_expire_time", OPERATION.c.expire_time_us)

@@ -19,13 +19,14 @@ from roel_service.store.operations import Operations
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
 from roel_service.store.references import referenced
+from roel_service.store.tasks import Tasks
 
 
 class Store:
     """What a server remembers; a context manager that holds the folder's lock.
 
     Attributes:
-        event_streams, maps, builds, operations: the repositories.
+        event_streams, maps, builds, operations, tasks: the repositories.
 
     Raises:
         InputError: a folder that cannot be created or written.
@@ -47,6 +48,7 @@ class Store:
             self.operations = Operations(
                 self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
             )
+            self.tasks = Tasks(self._database)
             self._sweep()
             self._resources = resources.pop_all()
 

@@ -6,7 +6,7 @@ import threading
 import time
 from pathlib import Path
 
-from roel_service.errors import EventsError
+from roel_service.errors import EventsError, LimitError, UnavailableError
 from roel_service.jobs.task import Partial
 from roel_service.progress import Progress
 
@@ -103,3 +103,53 @@ def build_nothing(parameters, progress):
     from roel_service.store.builds import BuiltVersion
 
     return BuiltVersion(rlm_bytes=b"map", line_count=0, bounds_m=[0.0] * 6, report={})
+
+
+def lose_worker(parameters, tell):
+    raise UnavailableError("task", "a worker", "none", reason="WORKER_LOST")
+
+
+def lose_worker_once(parameters, tell):
+    if Path(parameters).exists():
+        return build_nothing(None, tell)
+    Path(parameters).touch()
+    return lose_worker(None, tell)
+
+
+def fail_differently(parameters, tell):
+    """Each time with another class."""
+    counter = Path(parameters)
+    count = len(counter.read_bytes()) if counter.exists() else 0
+    counter.write_bytes(b"." * (count + 1))
+    raise (KeyError, IndexError, ValueError)[count]("a bug")
+
+
+def run_out_of_memory(parameters, tell):
+    raise LimitError("task", "less", "more", reason="TASK_OUT_OF_MEMORY")
+
+
+def advance_slowly(parameters, tell):
+    tell(step("first", 0))
+    time.sleep(0.01)
+    tell(step("first", 1))
+    tell(step("second", 2))
+    return build_nothing(None, tell)
+
+
+def wait(parameters, tell):
+    """Works until it is cancelled."""
+    while True:
+        tell(step("wait"))
+        time.sleep(0.005)
+
+
+def wait_for(parameters, tell):
+    while not Path(parameters).exists():
+        tell(step("wait"))
+        time.sleep(0.005)
+    return build_nothing(None, tell)
+
+
+def preview_then_wait(parameters, tell):
+    tell(Partial(result=build_nothing(None, tell)))
+    wait(None, tell)

@@ -6,7 +6,7 @@ import pytest
 
 from roel_service.errors import EventsError, LimitError, UnavailableError
 from roel_service.jobs.executors import InlineExecutor, ProcessExecutor
-from roel_service.jobs.faults import Fault
+from roel_service.jobs.faults import FaultError
 from roel_service.jobs.task import Limits, Partial, TaskSpec, Usage
 from roel_service.jobs.warm import WarmExecutor
 
@@ -70,7 +70,7 @@ class TestContract:
         assert caught.value.reason == "NO_EVENTS"
 
     def test_a_bug_is_logged_with_an_id_and_told_without_details(self, make, caplog):
-        with pytest.raises(Fault) as caught:
+        with pytest.raises(FaultError) as caught:
             heard(make, "fail")
         assert caught.value.found.split()[-1] in caplog.text
         assert "ZeroDivisionError" in caplog.text
@@ -78,7 +78,7 @@ class TestContract:
 
     def test_the_same_bug_has_the_same_fingerprint_and_another_one_has_not(self, make):
         def fingerprint(name, parameters):
-            with pytest.raises(Fault) as caught:
+            with pytest.raises(FaultError) as caught:
                 heard(make, name, parameters)
             return caught.value.fingerprint
 
@@ -86,7 +86,7 @@ class TestContract:
         assert fingerprint("fail", "once") != fingerprint("fail_elsewhere", "once")
 
     def test_an_unknown_entry_point_is_a_fault(self, make):
-        with pytest.raises(Fault):
+        with pytest.raises(FaultError):
             heard(make, "no_such_function")
 
     def test_a_cancelled_task_has_ended_when_cancelling_returns(self, make, tmp_path):
@@ -111,7 +111,7 @@ class TestContract:
 
     def test_it_takes_the_next_task_after_a_failed_and_a_cancelled_one(self, make):
         async def scenario(executor):
-            with pytest.raises(Fault):
+            with pytest.raises(FaultError):
                 await executor.run(spec("fail"), ignore)
             with pytest.raises(TimeoutError):
                 await asyncio.wait_for(executor.run(spec("tick", os.devnull), ignore), 0.05)
@@ -133,7 +133,7 @@ class TestChildren:
         assert caught.value.reason == "WORKER_LOST"
 
     def test_a_crash_is_a_fault(self, make):
-        with pytest.raises(Fault) as caught:
+        with pytest.raises(FaultError) as caught:
             heard(make, "die", "SIGSEGV")
         assert caught.value.fingerprint == "SIGSEGV"
 

@@ -25,3 +25,10 @@ def finalized(store, stream_id="walk", data=b"events", poses=b"poses"):
     store.event_streams.append_chunks(stream_id, [chunk(0, data)], LIMIT_BYTES)
     store.event_streams.append_poses(stream_id, pose_part(data=poses), max_pose_count=100)
     return store.event_streams.finalize(stream_id)
+
+
+def leased(store, operation):
+    """The lease of an operation's task, which is the next one."""
+    task = store.tasks.lease("tests")
+    assert task.operation_id == operation.id
+    return task.lease

@@ -4,7 +4,7 @@ from roel_service.errors import NotFoundError, StateError
 from roel_service.store.builds import BuiltVersion
 from roel_service.store.records import OperationState, VersionState
 
-from .samples import CAMERA, LIMIT_BYTES, chunk, finalized
+from .samples import CAMERA, LIMIT_BYTES, chunk, finalized, leased
 
 BUILT = BuiltVersion(
     rlm_bytes=b"map", line_count=3, bounds_m=[0.0] * 6, report={"seconds": {"trim": 0.5}}
@@ -29,7 +29,7 @@ def test_a_build_begins_queued_with_a_version_at_work(store, builds):
 
 def test_success_makes_the_version_active(store, builds):
     operation = builds.begin("house", "walk")
-    record = store.operations.succeed(operation.id, BUILT)
+    record = store.operations.succeed(leased(store, operation), BUILT)
     assert (record.state, record.fraction) == (OperationState.SUCCEEDED, 1.0)
     assert record.end_time_us >= record.create_time_us
     version = store.maps.version("house", operation.version)
@@ -44,7 +44,8 @@ def test_success_makes_the_version_active(store, builds):
 def test_any_other_end_fails_the_version(store, builds, end, state):
     operation = builds.begin("house", "walk")
     arguments = [b"why"] if end == "fail" else []
-    record = getattr(store.operations, end)(operation.id, *arguments)
+    subject = leased(store, operation) if end == "fail" else operation.id
+    record = getattr(store.operations, end)(subject, *arguments)
     assert record.state is state
     assert record.error == b"".join(arguments)
     assert store.maps.version("house", 1).state is VersionState.FAILED

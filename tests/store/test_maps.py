@@ -4,7 +4,7 @@ from roel_service.errors import ConflictError, NotFoundError, StateError
 from roel_service.store.builds import BuiltVersion
 from roel_service.store.records import VersionState
 
-from .samples import finalized
+from .samples import finalized, leased
 
 BUILT = BuiltVersion(
     rlm_bytes=b"map file", line_count=4, bounds_m=[0.0, 0, 0, 1, 2, 3], report={"line_count": 4}
@@ -21,7 +21,7 @@ def maps(store):
 def built(store, data=b"map file"):
     operation = store.builds.begin("house", "walk")
     version = BuiltVersion(rlm_bytes=data, line_count=4, bounds_m=BUILT.bounds_m, report={})
-    store.operations.succeed(operation.id, version)
+    store.operations.succeed(leased(store, operation), version)
     return store.maps.version("house", operation.version)
 
 

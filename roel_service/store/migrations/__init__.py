@@ -10,12 +10,17 @@ from collections.abc import Callable
 from sqlalchemy import Connection, text
 
 from roel_service.errors import StateError
-from roel_service.store.migrations import m001_first_tables, m002_methods_of_operations
+from roel_service.store.migrations import (
+    m001_first_tables,
+    m002_methods_of_operations,
+    m003_tasks,
+)
 
 # Step k leads from version k to k + 1.
 MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m001_first_tables.migrate,
     m002_methods_of_operations.migrate,
+    m003_tasks.migrate,
 )
 
 

@@ -1,0 +1,40 @@
+"""Rows of a task as work for a child."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from roel_service.config.stages import Config
+from roel_service.jobs.inputs import BuildParameters
+from roel_service.store.records import OperationRecord, TaskRecord
+from roel_service.store.store import Store
+from roel_service.v1 import config_pb2
+from roel_service.wire.configs import config_from_proto, config_to_proto
+
+# Entry point and parameters of the work; called in a thread for each attempt.
+Prepare = Callable[[OperationRecord, TaskRecord], tuple[str, Any]]
+
+
+def build_parameters_to_bytes(config: Config) -> bytes:
+    """What the row of a build's task says beside the rows that it works on."""
+    return bytes(config_to_proto(config).SerializeToString(deterministic=True))
+
+
+def build_preparation(store: Store, entrypoint: str) -> Prepare:
+    """How a build is prepared: its recording is frozen and cannot be deleted meanwhile."""
+
+    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, BuildParameters]:
+        streams = store.event_streams
+        stream = streams.get(operation.event_stream_id)
+        message = config_pb2.MappingConfig.FromString(task.parameters)
+        return entrypoint, BuildParameters(
+            event_file=streams.event_file(stream),
+            time_range_us=(stream.start_us, stream.end_us),
+            chunk_lengths=streams.chunk_lengths(stream),
+            pose_files=streams.pose_files(stream),
+            camera=stream.camera,
+            config=config_from_proto(message, "default"),
+        )
+
+    return prepare
