@@ -134,11 +134,15 @@ class Scheduler:
             UnavailableError: DRAINING.
             RoelError: whatever `begin` raises.
         """
-        if self._draining:
-            reason = "DRAINING"
-            raise UnavailableError("server", "one that takes work", "one that ends", reason=reason)
+        self.check_serving()
         # The operation must be announced although the caller goes away meanwhile.
         return await asyncio.shield(self._admit(begin))
+
+    def check_serving(self) -> None:
+        """Raise `UnavailableError` DRAINING when this server will do no more work."""
+        if self._draining:
+            found = "one that ends"
+            raise UnavailableError("server", "one that works", found, reason="DRAINING")
 
     async def cancel(self, operation_id: str) -> None:
         """End an operation, and return when nothing of it runs; one that has ended stays so."""
@@ -155,6 +159,7 @@ class Scheduler:
         """Take no more work, and give back what is under way; the next server continues it."""
         self._draining = True
         await _ended([*self._loops, *(running for _, running in self._attempts.values())])
+        self.changes.announce()
 
     async def _admit(self, begin: Begin) -> OperationRecord:
         async with self._admission:

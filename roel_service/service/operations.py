@@ -94,6 +94,7 @@ class OperationServicer:
                 return
             update_seq = max(update_seq, record.update_seq)
             await changed.wait()
+            self._scheduler.check_serving()
 
     async def _record(self, operation_id: str) -> OperationRecord:
         return await asyncio.to_thread(self._store.operations.get, operation_id)

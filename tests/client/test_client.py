@@ -20,7 +20,7 @@ from roel_service.v1 import events_pb2, events_pb2_grpc, maps_pb2, maps_pb2_grpc
 from roel_service.wire.rlm import decode_map
 
 from ..service.processes import CAMERA, config_of, events_of, new_id, trajectory_of
-from ..service.sample_builds import BUG, NO_ANSWER, QUICK, SLOW
+from ..service.sample_builds import BUG, NO_ANSWER, QUICK, SLOW, SLOW_ONCE
 
 # Nothing listens on the discard port of loopback.
 NOWHERE = "127.0.0.1:9"
@@ -69,7 +69,7 @@ def test_progress_goes_from_the_upload_to_the_stages(client):
 
 @pytest.mark.parametrize(
     ("seed", "kind", "reason"),
-    [(NO_ANSWER, NoAnswerError, "TOO_FEW_LINES"), (BUG, RoelError, "INTERNAL")],
+    [(NO_ANSWER, NoAnswerError, "TOO_FEW_LINES"), (BUG, RoelError, "POISONED")],
 )
 def test_what_goes_wrong_there_is_raised_here(client, kept, seed, kind, reason):
     with pytest.raises(RoelError) as caught:
@@ -145,8 +145,7 @@ def test_an_upload_continues_on_the_server_that_took_over(start_server):
     assert successors[0].stop() == 0
 
 
-def test_a_watch_outlives_a_broken_connection(start_server):
-    """The server is killed during a build; the one that follows tells how it ended."""
+def test_a_watch_and_its_build_outlive_a_killed_server(start_server):
     first = start_server()
     at_work = threading.Event()
     with Client(first.address) as client:
@@ -154,22 +153,18 @@ def test_a_watch_outlives_a_broken_connection(start_server):
         client.upload_poses(stream, trajectory_of(5))
         client.upload_events(stream, events_of(10))
         client.finalize(stream)
-        operation = client.build_map(client.create_map("house"), stream, config_of(SLOW))
+        operation = client.build_map(client.create_map("house"), stream, config_of(SLOW_ONCE))
         outcome = []
-
-        def wait():
-            try:
-                operation.wait(lambda progress: at_work.set())
-            except UnavailableError as error:
-                outcome.append(error)
-
-        waiting = threading.Thread(target=wait)
+        waiting = threading.Thread(
+            target=lambda: outcome.append(operation.wait(lambda progress: at_work.set()))
+        )
         waiting.start()
         at_work.wait()
+        first.child_pid()
         first.kill()
         second = start_server(port=first.port)
         waiting.join()
-    assert outcome[0].reason == "WORKER_LOST"
+    assert outcome[0].line_count == 3
     assert second.stop() == 0
 
 

@@ -166,6 +166,7 @@ class TestChildren:
             task = asyncio.create_task(executor.run(spec("tick", os.devnull), note))
             usage = await used.get()
             task.cancel()
+            await asyncio.wait({task})
             return usage
 
         usage = using(make, scenario)

@@ -79,7 +79,7 @@ if __name__ == "__main__":
 def test_a_child_does_not_outlive_a_killed_front(tmp_path):
     script, pid_file = tmp_path / "front.py", tmp_path / "pid"
     script.write_text(FRONT)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, script, pid_file]
     with subprocess.Popen(command, stdout=subprocess.PIPE, env=environment) as front:
         assert front.stdout.readline() == b"started\n"

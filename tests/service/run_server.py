@@ -15,7 +15,8 @@ def main():
 
     logging.basicConfig(level=logging.INFO)
     folder, port, settings = sys.argv[1:]
-    chosen = Settings(**{"build_entrypoint": "sample_builds:build", **json.loads(settings)})
+    defaults = {"build_entrypoint": "sample_builds:build", "retry_delay_s": 0.05}
+    chosen = Settings(**{**defaults, **json.loads(settings)})
     serving = serve(Path(folder), "127.0.0.1", int(port), on_ready=announce, settings=chosen)
     asyncio.run(serving)
 

@@ -1,6 +1,7 @@
 """Builds that need no algorithm; the seed of the configuration picks one."""
 
 import os
+import signal
 import time
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from roel_service.store.builds import BuiltVersion
 from roel_service.wire.provenance import Provenance
 from roel_service.wire.rlm import encode_map
 
-QUICK, SLOW, NO_ANSWER, BUG = range(4)
+QUICK, SLOW, NO_ANSWER, BUG, SLOW_ONCE, DIE = range(6)
 
 SEGMENTS = np.arange(18.0).reshape(3, 2, 3)
 
@@ -61,4 +62,22 @@ def fail(parameters, progress):
     raise ZeroDivisionError("a bug")
 
 
-BEHAVIOURS = {QUICK: quick, SLOW: slow, NO_ANSWER: give_up, BUG: fail}
+def slow_once(parameters, progress):
+    """Slow in the first attempt, quick in the next one."""
+    if Path(os.environ["SAMPLE_BUILD_PID"]).exists():
+        return quick(parameters, progress)
+    return slow(parameters, progress)
+
+
+def die(parameters, progress):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+BEHAVIOURS = {
+    QUICK: quick,
+    SLOW: slow,
+    NO_ANSWER: give_up,
+    BUG: fail,
+    SLOW_ONCE: slow_once,
+    DIE: die,
+}

@@ -22,7 +22,7 @@ from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 
 from .processes import config_of, new_id, ready_recording, wait_until
-from .sample_builds import BUG, QUICK, SLOW
+from .sample_builds import BUG, DIE, NO_ANSWER, QUICK, SLOW, SLOW_ONCE
 
 NOWHERE = "operations/" + "0" * 32
 
@@ -40,7 +40,7 @@ def begin(client, server, stream):
     def started(seed):
         server.pid_file.unlink(missing_ok=True)
         begun.append(client.build_map(client.create_map(new_id()), stream, config_of(seed)))
-        if seed == SLOW and len(begun) == 1:
+        if seed in (SLOW, SLOW_ONCE) and len(begun) == 1:
             server.child_pid()
         return begun[-1]
 
@@ -139,7 +139,8 @@ def test_waiting_has_a_timeout(begin, call):
 
 
 def test_waiting_ends_with_the_operation(begin, call):
-    assert call("WaitOperation", name=begin(BUG).name).error.code == code_pb2.INTERNAL
+    code = code_pb2.FAILED_PRECONDITION
+    assert call("WaitOperation", name=begin(NO_ANSWER).name).error.code == code
 
 
 def test_cancelling_ends_the_child_and_the_operation(server, begin, call):
@@ -164,11 +165,15 @@ def test_an_interrupted_wait_cancels_the_build(begin, call):
     assert call("GetOperation", name=operation.name).error.code == code_pb2.CANCELLED
 
 
-def test_a_killed_child_fails_its_operation_and_the_server_lives(server, begin, client):
-    operation = begin(SLOW)
+def test_a_killed_child_is_replaced_and_the_build_goes_on(server, begin):
+    operation = begin(SLOW_ONCE)
     os.kill(server.child_pid(), signal.SIGKILL)
+    assert operation.wait().line_count == 3
+
+
+def test_a_build_whose_children_are_all_killed_fails_and_the_server_lives(begin):
     with pytest.raises(UnavailableError, match="SIGKILL") as caught:
-        operation.wait()
+        begin(DIE).wait()
     assert caught.value.reason == "WORKER_LOST"
     assert begin(QUICK).wait().line_count == 3
 
@@ -176,7 +181,7 @@ def test_a_killed_child_fails_its_operation_and_the_server_lives(server, begin, 
 def test_a_bug_in_a_build_is_told_without_its_traceback(server, begin):
     with pytest.raises(RoelError) as caught:
         begin(BUG).wait()
-    assert caught.value.reason == "INTERNAL"
+    assert caught.value.reason == "POISONED"
     assert "ZeroDivisionError" not in str(caught.value)
     assert "ZeroDivisionError: a bug" in server.log
 
