@@ -134,6 +134,7 @@ _ROWS = (
         UnimplementedError,
         "a method that the protocol has and this server does not; GetCapabilities lists them",
     ),
+    Reason(
         "TASK_OUT_OF_MEMORY", LimitError, "work that needs more memory than the server lets it have"
     ),
     Reason("TASK_TIME_LIMIT", LimitError, "work that takes longer than the server lets it"),
