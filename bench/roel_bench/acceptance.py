@@ -19,12 +19,14 @@ LIMAP = tuple(name for name in PEERS if name.startswith("LIMAP") and name != LIM
 
 
 class Maps:
-    """Rows of maps, and means over those of the rooms that count."""
+    """Rows of maps, and means over those of the rooms that count; errors are no rows."""
 
     def __init__(self, rows: Iterable[Row], *, with_tuning: bool) -> None:
         self._rooms = REPORTING_ROOMS + (TUNING_ROOMS if with_tuning else ())
         self._rows = {
-            (row.scene, row.method, row.disturbance): row for row in rows if row.task == MAP
+            (row.scene, row.method, row.disturbance): row
+            for row in rows
+            if row.task == MAP and not row.error
         }
 
     def rows(

@@ -3,6 +3,7 @@
 | name | what |
 | --- | --- |
 | `sim_SEED_WxH_SECONDSs` | simulated room, made once and kept |
+| `curved_SEED_WxH_SECONDSs` | simulated room of round things, made once and kept |
 | `room_11`, `room_12` | rooms of another simulator, in the folder of recordings |
 | `slider_depth`, `events_room01` | real events with poses; events of a photographed room |
 | `boxes`, `disk`, `stripes`, `building` | real events without poses |
@@ -39,10 +40,12 @@ from roel_service.simulate.dataset import SimulationConfig, simulate_dataset
 # Parameters were chosen by looking at these, so their rows count in no mean.
 TUNING_ROOMS = ("room_11", "room_12")
 TUNING_SEEDS = range(101, 110)
+CURVED_TUNING_SEEDS = range(301, 310)
 
 LARGE_ROOMS = tuple(f"sim_{seed}_640x480_8s" for seed in range(201, 203))
 SMALL_ROOMS = tuple(f"sim_{seed}_346x260_6s" for seed in range(211, 213))
 REPORTING_ROOMS = LARGE_ROOMS + SMALL_ROOMS
+CURVED_ROOMS = tuple(f"curved_{seed}_346x260_4s" for seed in range(311, 314))
 POSED_RECORDINGS = ("slider_depth", "events_room01")
 POSELESS_RECORDINGS = ("boxes", "disk", "stripes", "building")
 # Small enough for a test, large enough for some lines.
@@ -51,8 +54,11 @@ TINY_ROOM = "sim_1_173x130_1s"
 WARM_UP_ROOM = "sim_1_120x90_0.4s"
 
 SIMULATED_NAME = re.compile(
-    r"sim_(?P<seed>\d{1,9})_(?P<width>\d{2,4})x(?P<height>\d{2,4})_(?P<seconds>\d{1,3}(\.\d)?)s"
+    r"(?P<kind>sim|curved)_(?P<seed>\d{1,9})_(?P<width>\d{2,4})x(?P<height>\d{2,4})_(?P<seconds>\d{1,3}(\.\d)?)s"
 )
+SIMULATED_NAMES = ("sim_SEED_WxH_SECONDSs", "curved_SEED_WxH_SECONDSs")
+# The scene of each kind of simulated room, and the seeds that parameters were chosen on.
+SIMULATED_KINDS = {"sim": ("room", TUNING_SEEDS), "curved": ("curved", CURVED_TUNING_SEEDS)}
 # Every so many events one is held back where there is no other truth.
 HELD_BACK_STRIDE = 10
 DAVIS240_SIZE = (240, 180)
@@ -90,7 +96,7 @@ def find_scene(name: str, places: Places) -> Opener:
         return lambda progress: replace(DATASETS[kind](place), name=name)
     if name not in RECORDINGS:
         published = [f"{kind}:DIR/SEQUENCE" for kind in DATASETS]
-        known = ", ".join(["sim_SEED_WxH_SECONDSs", *RECORDINGS, "folder:PATH", *published])
+        known = ", ".join([*SIMULATED_NAMES, *RECORDINGS, "folder:PATH", *published])
         raise InputError("scene", f"one of {known}", repr(name))
     data = places.data
     if data is None:
@@ -112,6 +118,7 @@ def _simulated(
 ) -> Scene:
     folder = rooms / name
     seed = int(arguments["seed"])
+    scene, tuning_seeds = SIMULATED_KINDS[arguments["kind"]]
     if not folder.exists():
         rooms.mkdir(parents=True, exist_ok=True)
         config = SimulationConfig(
@@ -119,9 +126,10 @@ def _simulated(
             width=int(arguments["width"]),
             height=int(arguments["height"]),
             panorama_count=0,
+            scene=scene,
         )
         simulate_dataset(folder, config, seed, progress)
-    return _folder(name, folder, is_tuning=seed in TUNING_SEEDS)
+    return _folder(name, folder, is_tuning=seed in tuning_seeds)
 
 
 def _folder(name: str, folder: Path, *, is_tuning: bool) -> Scene:
@@ -134,10 +142,18 @@ def _folder(name: str, folder: Path, *, is_tuning: bool) -> Scene:
         camera=camera,
         trajectory=read_trajectory(folder / "poses.txt"),
         noisy_trajectory=read_trajectory(noisy) if noisy.exists() else None,
-        truth=MapTruth(mesh=read_mesh(truth), edges=read_points(truth, "edges"))
-        if truth.exists()
-        else None,
+        truth=_map_truth(truth) if truth.exists() else None,
         is_tuning=is_tuning,
+    )
+
+
+def _map_truth(path: Path) -> MapTruth:
+    """Surfaces, edges, and which of these are round where the archive tells."""
+    tells_curves = read_npz(path, ("curved_edges",), str(path), InputError)
+    return MapTruth(
+        mesh=read_mesh(path),
+        edges=read_points(path, "edges"),
+        curved_edges=read_points(path, "curved_edges") if tells_curves else None,
     )
 
 

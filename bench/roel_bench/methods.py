@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
 
 from roel_bench.peers.el_slam import ElSlamSettings
 from roel_bench.peers.el_slam import map_segments as el_slam_segments
@@ -19,13 +16,11 @@ from roel_bench.results import config_digest, digest_of
 from roel_bench.scenes import Scene
 from roel_bench.variants import VARIANTS, Variant
 from roel_service.arrays import FloatArray
-from roel_service.errors import ConfigError, InputError, NoAnswerError
+from roel_service.errors import ConfigError, InputError
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.progress import ProgressCallback
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,7 +47,7 @@ class Method:
     Attributes:
         name: as the tables call it.
         digest: of all its parameters.
-        run: makes the map of a scene with poses.
+        run: makes the map of a scene with poses; raises `NoAnswerError` where a peer fails.
     """
 
     name: str
@@ -121,15 +116,12 @@ def _el_slam(settings: ElSlamSettings) -> Method:
 
 
 def _limap(name: str, settings: LimapSettings) -> Method:
-    """LIMAP on event images; lines that it cannot find are no lines, not a fault."""
+    """LIMAP on event images."""
 
     def make(scene: Scene, poses: Trajectory, progress: ProgressCallback) -> LineMap:
-        try:
-            segments = limap_segments(scene.events, poses, scene.camera, settings, progress)
-        except NoAnswerError as error:
-            logger.warning("LIMAP on %s: %s", scene.name, error)
-            segments = np.empty((0, 2, 3))
-        return LineMap.from_segments(segments)
+        return LineMap.from_segments(
+            limap_segments(scene.events, poses, scene.camera, settings, progress)
+        )
 
     return _peer(f"LIMAP: {name}", settings, make)
 

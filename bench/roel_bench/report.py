@@ -24,6 +24,7 @@ from roel_bench.tables import (
     FRAME_COLUMNS,
     MAP_COLUMNS,
     MISSING,
+    failures,
     figure_cells,
     mean,
     number,
@@ -190,6 +191,8 @@ def _peers(report: _Report) -> str:
         " rotation undone; `own_lines` gives LIMAP this project's lines and matches instead. What"
         " the paper prints for Replica is of other scenes."
     )
+    failed = failures(row for row in report.rows if row.method in PEERS)
+    text = f"{text}\n\n{failed}" if failed else text
     return _section(
         "Peers",
         text,

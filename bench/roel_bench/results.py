@@ -44,6 +44,8 @@ class Row:
         frame_count, event_count: frames looked at, 0 for a method without frames; events read.
         peak_rss_mib: the largest resident memory while the method ran; None where the system does
             not tell.
+        error: why there is no map, and so no figure: the reason and what was found; empty where
+            there is one. A map without lines is no error.
     """
 
     task: str
@@ -58,6 +60,7 @@ class Row:
     frame_count: int
     event_count: int
     peak_rss_mib: float | None
+    error: str = ""
 
     @property
     def key(self) -> tuple[str, ...]:

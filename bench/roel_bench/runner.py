@@ -22,7 +22,7 @@ from roel_bench.front_end import (
     lines_of_frames,
     run_front_end,
 )
-from roel_bench.methods import PEERS, find_method
+from roel_bench.methods import PEERS, Method, find_method
 from roel_bench.pictures import draw_frames, draw_map
 from roel_bench.results import (
     FILE_NAME,
@@ -65,7 +65,7 @@ class Runner:
     _warm: set[str] = field(default_factory=set)
 
     def run(self, cells: Iterable[Cell]) -> Results:
-        """Run the cells that the folder has no row of yet.
+        """Run the cells that the folder has no row of yet, or one that only tells of an error.
 
         Raises:
             InputError: an unknown scene; a folder that cannot be written, or that holds results
@@ -79,7 +79,7 @@ class Runner:
         scene: Scene | None = None
         truths = _FrameTruths()
         for index, (cell, key) in enumerate(zip(cells, keys, strict=True)):
-            if key in {row.key for row in results.rows}:
+            if key in {row.key for row in results.rows if not row.error}:
                 continue
             step = self._step(cell, index, len(cells))
             if scene is None or scene.name != cell.scene:
@@ -91,7 +91,8 @@ class Runner:
                 continue
             results = results.with_row(row)
             write_results(self.folder / FILE_NAME, results)
-            logger.info("%s %s %s: %s", cell.task, cell.scene, cell.method, row.figures)
+            told = row.error or row.figures
+            logger.info("%s %s %s: %s", cell.task, cell.scene, cell.method, told)
         return results
 
     def _results(self) -> Results:
@@ -137,7 +138,10 @@ class Runner:
         self._warm_up(cell)
         method = find_method(cell.method)
         memory.reset_peak()
-        mapped = method.run(scene, step)
+        try:
+            mapped = method.run(scene, step)
+        except NoAnswerError as error:
+            return _failed(cell, scene, method, error)
         peak_rss_mib = memory.peak_mib()
         figures = score(scene, mapped.entities)
         if cell.disturbance == NO_DISTURBANCE and cell.method in (*PRESET_NAMES, *PEERS):
@@ -199,11 +203,12 @@ class Runner:
             return
         self._warm.add(cell.method)
         room = open_scene(WARM_UP_ROOM, self.places, ignore)
-        if cell.task != FRONT_END:
-            find_method(cell.method).run(room, ignore)
-            return
-        config = find_variant(cell.method).config
-        with suppress(NoAnswerError):  # the longest windows are longer than the room
+        # The longest windows are longer than the room, and a peer may find nothing in it.
+        with suppress(NoAnswerError):
+            if cell.task != FRONT_END:
+                find_method(cell.method).run(room, ignore)
+                return
+            config = find_variant(cell.method).config
             run_front_end(room, config, None, lambda done, total: None, FRAME_STRIDE)
 
 
@@ -222,6 +227,26 @@ class _FrameTruths:
             if isinstance(truth, MapTruth) and truth.edges is not None and poses is not None:
                 self._truth = FrameTruth(scene, truth, poses)
         return self._truth
+
+
+def _failed(cell: Cell, scene: Scene, method: Method, error: NoAnswerError) -> Row:
+    """The row of a method that made no map."""
+    logger.warning("%s on %s: %s", method.name, scene.name, error)
+    return Row(
+        task=cell.task,
+        scene=scene.name,
+        sensor=scene.sensor,
+        is_tuning=scene.is_tuning,
+        disturbance=cell.disturbance,
+        method=method.name,
+        config_digest=method.digest,
+        figures={},
+        seconds={},
+        frame_count=0,
+        event_count=0,
+        peak_rss_mib=None,
+        error=f"{error.reason}: {error.found}",
+    )
 
 
 def _key(cell: Cell) -> tuple[str, ...]:

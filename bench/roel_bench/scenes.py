@@ -21,10 +21,12 @@ class MapTruth:
     Attributes:
         mesh: surfaces.
         edges: observable edge points; None where only the surfaces are known.
+        curved_edges: those of them that lie on round edges; None where that is not known.
     """
 
     mesh: TriangleMesh
     edges: PointCloud | None
+    curved_edges: PointCloud | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -8,6 +8,7 @@ from dataclasses import asdict
 import numpy as np
 
 from roel_bench.coverage import coverage_figures
+from roel_bench.curve_figures import curve_figures
 from roel_bench.results import Figures
 from roel_bench.scenes import HeldBackEvents, LineTruth, MapTruth, Scene
 from roel_service.arrays import FloatArray
@@ -67,6 +68,8 @@ def _against_surfaces(truth: MapTruth, entities: LineMap | FloatArray) -> Figure
     if truth.edges is not None:
         figures = asdict(evaluate_points(samples, truth.mesh, truth.edges))
         del figures["line_count"]  # the entities are counted already
+        if truth.curved_edges is not None:
+            figures |= curve_figures(samples, truth.edges.points, truth.curved_edges.points)
         return figures
     distance_mm = 1e3 * distances_to_mesh(samples, truth.mesh)
     precision: Figures = {

@@ -79,11 +79,22 @@ def all_rows(results: Results) -> str:
         if rows:
             headings = ["scene", "disturbance", "method", *(name for name, _, _ in columns)]
             cells = (
-                [row.scene, row.disturbance, row.method, *figure_cells([row], columns)]
+                [row.scene, row.disturbance, _method_cell(row), *figure_cells([row], columns)]
                 for row in rows
             )
             blocks.append(f"## {title}\n\n{table(headings, cells)}\n")
     return "\n".join(blocks)
+
+
+def failures(rows: Iterable[Row]) -> str:
+    """Rows that hold an error in place of figures, a sentence each; empty where there are none."""
+    return " ".join(
+        f"{row.method} has no map of {row.scene}: {row.error}." for row in rows if row.error
+    )
+
+
+def _method_cell(row: Row) -> str:
+    return f"{row.method} (**{row.error}**)" if row.error else row.method
 
 
 def write_text(path: Path, text: str) -> None:

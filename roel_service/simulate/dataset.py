@@ -22,6 +22,7 @@ from roel_service.io.poses import write_trajectory
 from roel_service.progress import Progress, ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream, concatenate
+from roel_service.simulate.curved import curved_room
 from roel_service.simulate.meshes import scene_from_mesh
 from roel_service.simulate.motion import Motion, as_odometry, walk_around, walk_in_room
 from roel_service.simulate.panoramas import render_panorama
@@ -29,9 +30,9 @@ from roel_service.simulate.render import THREAD_COUNT, render, render_depth
 from roel_service.simulate.rooms import furnished_room, grid_cube
 from roel_service.simulate.scenes import Scene, texture_atlas
 from roel_service.simulate.sensor import EventSensor, SensorModel
-from roel_service.simulate.truth import observable_edges, surface_cloud
+from roel_service.simulate.truth import edges_along, observable_edges, surface_cloud
 
-SCENES = ("room", "cube")
+SCENES = ("room", "cube", "curved")
 # The cube is looked at from this far, as in the paper.
 CUBE_DISTANCE = 25.0
 # Side of a room, in whose units voxels and noise are given.
@@ -68,7 +69,8 @@ class SimulationConfig:
         fov_deg: horizontal field of view.
         panorama_count: panoramas beside the events.
         panorama_width: px.
-        scene: `room`, a furnished room of chance, or `cube`, the paper's cube.
+        scene: `room`, a furnished room of chance; `cube`, the paper's cube; or `curved`, a room of
+            round things.
         mesh: a textured mesh of the user's; takes the place of the scene.
         sensor: thresholds and noise.
 
@@ -231,11 +233,15 @@ class _Recording:
             self.scale,
             lambda done, total: self._tell("edges", done, total),
         )
-        triangles = self.scene.triangles.astype(np.float32)
         bounds_m = self.scene.bounds_m
-        write_npz(
-            folder / "gt.npz", triangles=triangles, edges=edges, dims=bounds_m[1] - bounds_m[0]
-        )
+        truth = {
+            "triangles": self.scene.triangles.astype(np.float32),
+            "edges": edges,
+            "dims": bounds_m[1] - bounds_m[0],
+        }
+        if self.scene.rims:
+            truth["curved_edges"] = edges_along(self.scene.rims, edges, self.scale)
+        write_npz(folder / "gt.npz", **truth)
         self._tell("cloud", 0, 1)
         chance = self.rng["cloud"]
         places = self._places(CLOUD_PLACE_COUNT, chance)
@@ -298,7 +304,9 @@ class _Counter:
 def _scene(config: SimulationConfig, rng: np.random.Generator) -> Scene:
     if config.mesh is not None:
         return scene_from_mesh(config.mesh)
-    return furnished_room(rng) if config.scene == "room" else grid_cube()
+    if config.scene == "cube":
+        return grid_cube()
+    return furnished_room(rng) if config.scene == "room" else curved_room(rng)
 
 
 def picture_times(scene: Scene, motion: Motion, camera: Camera, duration_us: int) -> IntArray:

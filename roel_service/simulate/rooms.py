@@ -113,14 +113,14 @@ def furnished_room(rng: np.random.Generator) -> Scene:
     """A room of about 4.5 by 4.5 m: floor, walls, door, windows, pictures and furniture."""
     size = np.array([rng.uniform(4.2, 5.6), rng.uniform(4.2, 5.4), rng.uniform(2.5, 2.9)])
     build = SceneBuilder()
-    _shell(build, size, rng)
+    shell(build, size, rng)
     walls = [Wall(side, size) for side in range(4)]
     order = rng.permutation(4)
     # What stands in a corner stands at this end of its wall, so that no two share a corner.
     hand = rng.choice([-1.0, 1.0])
-    _door(build, walls[order[0]], -hand, rng)
-    _window(build, walls[order[1]], rng)
-    _window(build, walls[order[2]], rng)
+    door(build, walls[order[0]], -hand, rng)
+    window(build, walls[order[1]], rng)
+    window(build, walls[order[2]], rng)
     _shelf(build, walls[order[3]], hand, rng)
     for wall in walls:
         _pictures(build, wall, rng)
@@ -172,7 +172,7 @@ class Wall:
         build.box(centre, np.array(size), texture, yaw_rad=self.yaw_rad, front=front)
 
 
-def _shell(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> None:
+def shell(build: SceneBuilder, size: FloatArray, rng: np.random.Generator) -> None:
     """Floor, ceiling with lamps, walls with boards below and above, a rug."""
     floor = textures.planks(14, rng) if rng.random() < 0.6 else textures.tiles(8, rng)
     # Darker than the frames of doors and windows and the cornice.
@@ -206,7 +206,8 @@ def _lamp(build: SceneBuilder, place: FloatArray) -> None:
     build.box(place - [0.0, 0.0, 0.03], np.array([1.0, 0.25, 0.05]), light)
 
 
-def _door(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
+def door(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator) -> None:
+    """A closed door in its frame."""
     along = hand * rng.uniform(0.1, 0.25) * wall.width_m
     frame = build.texture(textures.plain(rng.uniform(0.75, 0.9) * np.ones(3)))
     leaf = rng.uniform(0.2, 0.5) * np.array([1.0, 0.75, 0.5])
@@ -218,7 +219,8 @@ def _door(build: SceneBuilder, wall: Wall, hand: float, rng: np.random.Generator
     wall.take(along, 1.06)
 
 
-def _window(build: SceneBuilder, wall: Wall, rng: np.random.Generator) -> None:
+def window(build: SceneBuilder, wall: Wall, rng: np.random.Generator) -> None:
+    """A window with what is seen through it."""
     width, height = rng.uniform(0.9, 1.5), rng.uniform(0.9, 1.2)
     along = rng.uniform(-0.3, 0.3) * (wall.width_m - width)
     frame = build.texture(textures.plain(np.full(3, 0.88)))

@@ -31,6 +31,8 @@ class Scene:
         brightness: (T,) float32 light on each triangle, a factor of its texture.
         textures: (H, W, 3) float32 images each, linear intensity, 0 to 1, red first.
         background: intensity where nothing is hit.
+        rims: (n, 3) m each: the round edges, as chains of points that deviate from the surfaces by
+            no more than these do from being round.
     """
 
     triangles: FloatArray
@@ -39,6 +41,7 @@ class Scene:
     brightness: Array
     textures: tuple[Array, ...]
     background: float = 0.5
+    rims: tuple[FloatArray, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.triangles) == 0:

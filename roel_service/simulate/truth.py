@@ -8,6 +8,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.geometry import projection
 from roel_service.geometry.se3 import SE3
+from roel_service.geometry.segments import point_segment_distance
 from roel_service.in_order import in_order
 from roel_service.progress import StepCallback
 from roel_service.simulate.panoramas import FACE_ROTATIONS
@@ -16,6 +17,8 @@ from roel_service.simulate.scenes import Scene, TextureAtlas
 
 # Voxels of edge points, and how many views must agree on one.
 EDGE_VOXEL_M = 0.005
+# An edge point this close to a rim is of it: the voxel, and a pixel of the views.
+RIM_DISTANCE_M = 0.01
 MIN_VIEW_COUNT = 2
 # Views for the edges have this many times the sensor's resolution.
 EDGE_ZOOM = 2
@@ -82,6 +85,21 @@ def _edge_points(
     rows, columns = np.nonzero(cv2.Canny(grey, CANNY_LOW, CANNY_HIGH))
     hit = np.isfinite(nearest_m[rows, columns])
     return _lifted(rows[hit], columns[hit], np.asarray(nearest_m), K, T_world_camera)
+
+
+def edges_along(rims: tuple[FloatArray, ...], edges: Array, scale: float) -> Array:
+    """The (k, 3) edge points beside one of the rims.
+
+    Args:
+        rims: (n, 3) m each, chains of points.
+        edges: (M, 3) m.
+        scale: of the distance, in units of a room.
+    """
+    nearest_m = np.full(len(edges), np.inf)
+    for rim in rims:
+        for piece in np.stack([rim[:-1], rim[1:]], axis=1):
+            np.minimum(nearest_m, point_segment_distance(edges, piece), out=nearest_m)
+    return edges[nearest_m < RIM_DISTANCE_M * scale]
 
 
 def surface_cloud(

@@ -14,27 +14,7 @@ from roel_bench.disturbances import (
 from roel_service.errors import InputError
 from roel_service.scene.events import EventStream, concatenate
 from tests.bench.samples import moving_camera, random_events, scene
-
-
-class InChunks:
-    """A stream in pieces, as a file gives it."""
-
-    def __init__(self, stream: EventStream, size: int) -> None:
-        self.stream, self.size = stream, size
-        self.width, self.height = stream.width, stream.height
-        self.time_range_us = stream.time_range_us
-
-    def chunks(self):
-        for start in range(0, len(self.stream), self.size):
-            part = self.stream.slice(start, start + self.size, 0)
-            yield EventStream(
-                t_us=part.t_us,
-                x=part.x,
-                y=part.y,
-                polarity=part.polarity,
-                width=self.width,
-                height=self.height,
-            )
+from tests.chunked import InChunks
 
 
 def events_of(disturbed):

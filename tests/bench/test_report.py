@@ -139,3 +139,16 @@ def test_page_is_written(tmp_path):
 
 def test_committed_page_is_what_the_committed_rows_give():
     assert report.DOCUMENT.read_text() == report.document(read_results(report.RESULTS))
+
+
+def test_a_peer_that_failed_is_told_and_counts_in_no_mean():
+    failed = row(SMALL, method="LIMAP: best_10", error="PEER_FAILED: exit code -6: abort")
+    results = Results(
+        machine=RESULTS.machine,
+        versions=RESULTS.versions,
+        rows=(*ROWS, failed, row(LARGE, method="LIMAP: best_10", figures=figures(0.1))),
+    )
+    page = report.document(results)
+    assert f"LIMAP: best_10 has no map of {SMALL}: PEER_FAILED: exit code -6: abort." in page
+    assert "LIMAP: best_10, 640x480, 1 rooms" in page
+    assert "LIMAP: best_10, 346x260" not in page

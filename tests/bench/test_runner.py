@@ -1,14 +1,18 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from roel_bench import runner
 from roel_bench.catalogue import WARM_UP_ROOM, Places
-from roel_bench.methods import find_method
+from roel_bench.methods import Mapped, Method, find_method
 from roel_bench.results import FILE_NAME, Results, read_results, write_results
 from roel_bench.runner import Runner
 from roel_bench.suites import FRONT_END, MAP, Cell
+from roel_bench.tables import all_rows
 from roel_service.errors import InputError, NoAnswerError
 from roel_service.progress import Progress
+from roel_service.scene.lines import LineMap
 from tests.bench.samples import row
 
 CELLS = [
@@ -110,3 +114,34 @@ def test_windows_longer_than_the_warm_up_are_no_obstacle(places, tmp_path):
     longer = replace(cell, scene="sim_1_32x24_0.7s")
     results = Runner(places=places, folder=tmp_path).run([longer])
     assert results.rows[0].frame_count >= 1
+
+
+def fails(reason):
+    def run(scene, progress):
+        raise NoAnswerError("limap", "segments", "exit code -6: abort", reason=reason)
+
+    return Method(name="LIMAP: best_10", digest="0" * 12, run=run)
+
+
+@pytest.mark.parametrize("reason", ["PEER_FAILED", "PEER_TIMEOUT"])
+def test_a_peer_that_fails_is_an_error_and_no_empty_map(places, tmp_path, monkeypatch, reason):
+    cell = Cell(task=MAP, scene=WARM_UP_ROOM, method="LIMAP: best_10")
+    monkeypatch.setattr(runner, "find_method", lambda name: fails(reason))
+    results = Runner(places=places, folder=tmp_path).run([cell])
+    (failed,) = results.rows
+    assert failed.error == f"{reason}: exit code -6: abort"
+    assert failed.figures == {}
+    assert read_results(tmp_path / FILE_NAME) == results
+    assert f"LIMAP: best_10 (**{failed.error}**)" in all_rows(results)
+
+
+def test_a_peer_that_failed_is_run_again(places, tmp_path, monkeypatch):
+    cell = Cell(task=MAP, scene=WARM_UP_ROOM, method="LIMAP: best_10")
+    monkeypatch.setattr(runner, "find_method", lambda name: fails("PEER_TIMEOUT"))
+    Runner(places=places, folder=tmp_path).run([cell])
+    empty = Mapped(entities=LineMap.from_segments(np.empty((0, 2, 3))), seconds={"map": 1.0})
+    found = Method(name=cell.method, digest="0" * 12, run=lambda scene, progress: empty)
+    monkeypatch.setattr(runner, "find_method", lambda name: found)
+    (row,) = Runner(places=places, folder=tmp_path).run([cell]).rows
+    assert row.error == ""
+    assert row.figures["iou_20"] == 0.0

@@ -22,6 +22,7 @@ from roel_service.geometry.segments import point_segment_distance
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.scene.events import EventStream
 from roel_service.scene.results import MAPPING_STAGES, TrackStatus
+from tests.chunked import InChunks
 
 from .synthetic import CAMERA, DURATION_US, SEGMENTS_WORLD, event_stream, trajectory
 
@@ -40,32 +41,6 @@ PAPER = dataclasses.replace(
     frames=dataclasses.replace(preset("paper").frames, rate_hz=20.0),
     runtime=CONFIG.runtime,
 )
-
-
-class Chunked:
-    """An event source in pieces of a given number of events."""
-
-    width, height = CAMERA.width, CAMERA.height
-
-    def __init__(self, stream, size):
-        self.stream = stream
-        self.size = size
-
-    @property
-    def time_range_us(self):
-        return self.stream.time_range_us
-
-    def chunks(self):
-        for start in range(0, len(self.stream), self.size):
-            part = self.stream.slice(start, start + self.size, 0)
-            yield EventStream(
-                t_us=part.t_us,
-                x=part.x,
-                y=part.y,
-                polarity=part.polarity,
-                width=self.width,
-                height=self.height,
-            )
 
 
 def built(events=None, config=CONFIG, poses=None, **substitutes):
@@ -167,7 +142,7 @@ class TestReproducible:
         events = event_stream(last_us=DURATION_US // 2)
         runtime = dataclasses.replace(config.runtime, worker_count=2)
         one = built(events, config)
-        two = built(Chunked(events, 7_001), dataclasses.replace(config, runtime=runtime))
+        two = built(InChunks(events, 7_001), dataclasses.replace(config, runtime=runtime))
         assert len(one.line_map) > 0
         assert_equal_maps(one, two)
 

@@ -28,7 +28,12 @@ def add_commands(subparsers: Subparsers) -> None:
     )
     parser.add_argument("--panoramas", dest="panorama_count", type=integer(0, 999), metavar="N")
     scene = parser.add_mutually_exclusive_group()
-    scene.add_argument("--scene", type=one_of("room", "cube"), metavar="NAME", help="room or cube")
+    scene.add_argument(
+        "--scene",
+        type=one_of("room", "cube", "curved"),
+        metavar="NAME",
+        help="room, cube or curved (a room of round things)",
+    )
     scene.add_argument("--mesh", metavar="FILE", help="textured mesh of your own: glb, obj or ply")
 
 
