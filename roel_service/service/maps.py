@@ -13,8 +13,10 @@ from roel_service.config.stages import Config
 from roel_service.errors import ConfigError
 from roel_service.jobs.preparation import build_parameters_to_bytes
 from roel_service.jobs.scheduler import Scheduler
+from roel_service.service.labels import checked_display_name, checked_labels, updated_fields
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import map_to_proto, map_version_to_proto, operation_to_proto
+from roel_service.service.requests import request_id
 from roel_service.service.settings import Settings
 from roel_service.store.records import MapVersionRecord
 from roel_service.store.store import Store
@@ -35,8 +37,14 @@ class MapServicer:
 
     async def CreateMap(self, request: maps_pb2.CreateMapRequest, context: Any) -> maps_pb2.Map:
         names.check_parent(request.parent)
-        map_id = names.checked_id(request.map_id, "map_id")
-        return map_to_proto(await asyncio.to_thread(self._store.maps.create, map_id))
+        record = await asyncio.to_thread(
+            self._store.maps.create,
+            names.checked_id(request.map_id, "map_id"),
+            display_name=checked_display_name(request.map.display_name, self._settings),
+            labels=checked_labels(request.map.labels, self._settings),
+            request=request_id(request),
+        )
+        return map_to_proto(record)
 
     async def GetMap(self, request: maps_pb2.GetMapRequest, context: Any) -> maps_pb2.Map:
         map_id = names.map_id(request.name)
@@ -46,18 +54,34 @@ class MapServicer:
         self, request: maps_pb2.ListMapsRequest, context: Any
     ) -> maps_pb2.ListMapsResponse:
         names.check_parent(request.parent)
-        wanted = page_request("maps", request.page_size, request.page_token)
-        fetch = self._store.maps.page
+        scope = f"maps?show_deleted={request.show_deleted}"
+        wanted = page_request(scope, request.page_size, request.page_token)
+        fetch = partial(self._store.maps.page, show_deleted=request.show_deleted)
         page = await asyncio.to_thread(page_of, wanted, fetch, lambda item: item.id)
         return maps_pb2.ListMapsResponse(
             maps=[map_to_proto(item) for item in page.items],
             next_page_token=page.next_page_token,
         )
 
+    async def UpdateMap(self, request: maps_pb2.UpdateMapRequest, context: Any) -> maps_pb2.Map:
+        map_id = names.map_id(request.map.name)
+        values = updated_fields(request.map, list(request.update_mask.paths), self._settings)
+        update = self._store.maps.update
+        etag = request.map.etag
+        record = await asyncio.to_thread(update, map_id, values, etag, request_id(request))
+        return map_to_proto(record)
+
     async def DeleteMap(self, request: maps_pb2.DeleteMapRequest, context: Any) -> maps_pb2.Map:
         map_id = names.map_id(request.name)
-        record = await asyncio.to_thread(self._store.maps.get, map_id)
-        await asyncio.to_thread(self._store.maps.delete, map_id)
+        maps = self._store.maps
+        delete = maps.purge if request.purge else maps.delete
+        record = await asyncio.to_thread(delete, map_id, request.etag, request_id(request))
+        return map_to_proto(record)
+
+    async def UndeleteMap(self, request: maps_pb2.UndeleteMapRequest, context: Any) -> maps_pb2.Map:
+        map_id = names.map_id(request.name)
+        undelete = self._store.maps.undelete
+        record = await asyncio.to_thread(undelete, map_id, request.etag, request_id(request))
         return map_to_proto(record)
 
     async def BuildMap(
@@ -88,6 +112,29 @@ class MapServicer:
             map_versions=[map_version_to_proto(item) for item in page.items],
             next_page_token=page.next_page_token,
         )
+
+    async def DeleteMapVersion(
+        self, request: maps_pb2.DeleteMapVersionRequest, context: Any
+    ) -> maps_pb2.MapVersion:
+        map_id, label = names.map_version_id(request.name)
+        delete = self._store.maps.delete_version
+        record = await asyncio.to_thread(delete, map_id, label, request_id(request))
+        return map_version_to_proto(record)
+
+    async def PromoteMapVersion(
+        self, request: maps_pb2.PromoteMapVersionRequest, context: Any
+    ) -> maps_pb2.Map:
+        map_id, label = names.map_version_id(request.name)
+        record = await asyncio.to_thread(
+            self._store.maps.promote,
+            map_id,
+            label,
+            names.checked_alias(request.alias),
+            self._settings.alias_count,
+            etag=request.etag,
+            request=request_id(request),
+        )
+        return map_to_proto(record)
 
     async def ExportMap(
         self, request: maps_pb2.ExportMapRequest, context: Any

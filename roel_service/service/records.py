@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from google.longrunning import operations_pb2
@@ -21,7 +22,7 @@ from roel_service.store.records import (
     StreamState,
     VersionState,
 )
-from roel_service.v1 import events_pb2, maps_pb2, types_pb2
+from roel_service.v1 import events_pb2, map_file_pb2, maps_pb2, types_pb2
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.wire import names
 from roel_service.wire.errors import status_from_error
@@ -38,6 +39,7 @@ _VERSION_STATES = {
     VersionState.PREVIEW: maps_pb2.MapVersion.STATE_PREVIEW,
     VersionState.ACTIVE: maps_pb2.MapVersion.STATE_ACTIVE,
     VersionState.FAILED: maps_pb2.MapVersion.STATE_FAILED,
+    VersionState.DELETED: maps_pb2.MapVersion.STATE_DELETED,
 }
 
 
@@ -60,11 +62,21 @@ def event_stream_to_proto(record: EventStreamRecord) -> events_pb2.EventStream:
 
 def map_to_proto(record: MapRecord) -> maps_pb2.Map:
     """A map."""
-    return maps_pb2.Map(
+    message = maps_pb2.Map(
         name=names.map_name(record.id),
+        uid=record.uid,
         version_count=record.version_count,
+        display_name=record.display_name,
+        labels=record.labels,
+        aliases={alias: f"v{version}" for alias, version in record.aliases.items()},
+        etag=record.etag,
         create_time=_timestamp(record.create_time_us),
+        update_time=_timestamp(record.update_time_us),
     )
+    if record.is_deleted:
+        message.delete_time.CopyFrom(_timestamp(record.delete_time_us))
+        message.purge_time.CopyFrom(_timestamp(record.purge_time_us))
+    return message
 
 
 def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
@@ -72,18 +84,33 @@ def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
     message = maps_pb2.MapVersion(
         name=names.map_version_name(record.map_id, record.version),
         state=_VERSION_STATES[record.state],
-        event_stream=names.event_stream_name(record.event_stream_id),
         operation=names.operation_name(record.operation_id),
         create_time=_timestamp(record.create_time_us),
     )
+    if record.event_stream_id:
+        message.event_stream = names.event_stream_name(record.event_stream_id)
     if record.state.is_usable:
         blob = types_pb2.BlobRef(sha256=record.sha256, size_bytes=record.size_bytes)
         corners = np.array(record.bounds_m).reshape(2, 3)
         message.map.CopyFrom(blob)
         message.line_count = record.line_count
         message.bounds.CopyFrom(bounds_to_proto(corners[0], corners[1]))
+        message.provenance.CopyFrom(map_file_pb2.MapProvenance(**record.provenance))
+    if record.state.is_usable and record.report:
         message.report.CopyFrom(report_to_proto(record.report))
+    if record.imported_file:
+        message.imported_file.CopyFrom(_imported_file(record.imported_file))
+    if record.state is VersionState.DELETED:
+        message.purge_time.CopyFrom(_timestamp(record.purge_time_us))
     return message
+
+
+def _imported_file(imported: dict[str, Any]) -> maps_pb2.ImportedFile:
+    return maps_pb2.ImportedFile(
+        blob=types_pb2.BlobRef(sha256=imported["sha256"], size_bytes=imported["size_bytes"]),
+        format=imported.get("format", ""),
+        dropped_line_count=imported.get("dropped_line_count", 0),
+    )
 
 
 def operation_to_proto(record: OperationRecord, answer: Message | None) -> operations_pb2.Operation:

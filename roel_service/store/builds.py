@@ -11,7 +11,7 @@ from roel_service.errors import StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.event_streams import get_finalized
-from roel_service.store.maps import get_map
+from roel_service.store.map_rows import get_map
 from roel_service.store.operations import queued_operation
 from roel_service.store.records import (
     MapVersionRecord,

@@ -1,79 +1,211 @@
-"""Maps and their versions; versions come to be in `builds`."""
+"""Maps, their aliases and their versions; versions come to be in `builds`."""
 
 from __future__ import annotations
 
-from sqlalchemy import Connection, delete, exists, func, insert, select
+import dataclasses
+import json
+import uuid
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
-from roel_service.errors import ConflictError, NotFoundError, StateError
+from sqlalchemy import Connection, delete, select
+
+from roel_service.errors import LimitError, StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
+from roel_service.store.map_rows import (
+    LATEST,
+    change_map,
+    change_version,
+    check_etag,
+    check_state,
+    check_unused,
+    find_map,
+    forget_map,
+    get_current_map,
+    get_map,
+    get_version,
+    insert_map,
+    map_records,
+    set_alias,
+)
 from roel_service.store.records import (
-    UNFINISHED,
+    USABLE,
     MapRecord,
     MapVersionRecord,
     VersionState,
-    map_from_row,
     map_version_from_row,
     now_us,
-    row_from_record,
 )
-from roel_service.store.references import delete_unreferenced
-from roel_service.store.schema import MAP, MAP_VERSION, OPERATION
+from roel_service.store.requests import Memory, RequestId, once, row_memory
+from roel_service.store.retention import DAY_US, DELETED_MAP_RETENTION_DAYS
+from roel_service.store.schema import MAP, MAP_VERSION
+
+_MAP_MEMORY: Memory[MapRecord] = Memory(
+    lambda record: json.dumps(dataclasses.asdict(record)),
+    lambda text: MapRecord(**json.loads(text)),
+)
+_VERSION_MEMORY = row_memory(map_version_from_row)
 
 
 class Maps:
-    """Repository of maps. Every method that changes something is durable on return."""
+    """Repository of maps. Every method that changes something is durable on return.
+
+    Methods that change something take the request id that the caller gave, or None, and where it
+    is named the etag that the map must have, or an empty one.
+    """
 
     def __init__(self, database: Database, blobs: BlobStore) -> None:
         self._database = database
         self._blobs = blobs
 
-    def create(self, map_id: str) -> MapRecord:
+    def create(
+        self,
+        map_id: str,
+        *,
+        display_name: str = "",
+        labels: dict[str, str] | None = None,
+        request: RequestId | None = None,
+    ) -> MapRecord:
         """Name a map; raises `ConflictError` ALREADY_EXISTS."""
-        record = MapRecord(id=map_id, version_count=0, create_time_us=now_us())
-        with self._database.write() as connection:
-            if connection.execute(select(exists().where(MAP.c.id == map_id))).scalar_one():
-                raise ConflictError("map", "an id not in use", map_id, reason="ALREADY_EXISTS")
-            connection.execute(insert(MAP), row_from_record(record))
-        return record
+        now = now_us()
+        record = MapRecord(
+            id=map_id,
+            uid=uuid.uuid4().hex,
+            version_count=0,
+            display_name=display_name,
+            labels=labels or {},
+            aliases={},
+            revision=1,
+            create_time_us=now,
+            update_time_us=now,
+            delete_time_us=0,
+            purge_time_us=0,
+        )
+        return self._changed(request, partial(insert_map, record=record))
 
     def get(self, map_id: str) -> MapRecord:
-        """One map; raises `NotFoundError`."""
+        """One map, also a deleted one; raises `NotFoundError`."""
         with self._database.read() as connection:
-            return get_map(connection, map_id)
+            return find_map(connection, map_id)
 
-    def page(self, after_id: str, limit: int) -> list[MapRecord]:
+    def page(self, after_id: str, limit: int, *, show_deleted: bool = False) -> list[MapRecord]:
         """Maps with an id above `after_id`, in the order of ids."""
         query = select(MAP).where(MAP.c.id > after_id).order_by(MAP.c.id).limit(limit)
+        if not show_deleted:
+            query = query.where(MAP.c.delete_time_us == 0)
         with self._database.read() as connection:
-            return [map_from_row(row) for row in connection.execute(query).mappings()]
+            return map_records(connection, connection.execute(query).mappings().all())
 
-    def delete(self, map_id: str) -> None:
-        """Forget a map with its versions; raises `StateError` MAP_IN_USE during a build."""
-        with self._database.write() as connection:
-            get_map(connection, map_id)
-            if _is_in_use(connection, map_id):
-                raise StateError(map_id, "no build", "one at work", reason="MAP_IN_USE")
-            of_map = select(MAP_VERSION.c.sha256).where(MAP_VERSION.c.map_id == map_id)
-            digests = set(connection.scalars(of_map))
-            connection.execute(delete(OPERATION).where(OPERATION.c.map_id == map_id))
-            connection.execute(delete(MAP).where(MAP.c.id == map_id))
-        delete_unreferenced(self._database, self._blobs, digests)
+    def update(
+        self, map_id: str, values: dict[str, Any], etag: str, request: RequestId | None
+    ) -> MapRecord:
+        """Change fields of a map.
 
-    def version(self, map_id: str, version: int | None) -> MapVersionRecord:
-        """One version, by default the newest ACTIVE one; raises `NotFoundError`."""
+        Raises:
+            StateError: MAP_DELETED.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            return change_map(connection, get_current_map(connection, map_id, etag), values)
+
+        return self._changed(request, act)
+
+    def delete(self, map_id: str, etag: str, request: RequestId | None) -> MapRecord:
+        """Delete a map, so that it can be undeleted for some time.
+
+        Raises:
+            StateError: MAP_DELETED, or MAP_IN_USE while a version is being made.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            record = get_current_map(connection, map_id, etag)
+            check_unused(connection, map_id)
+            now = now_us()
+            purge_time_us = now + DELETED_MAP_RETENTION_DAYS * DAY_US
+            times = {"delete_time_us": now, "purge_time_us": purge_time_us}
+            return change_map(connection, record, times)
+
+        return self._changed(request, act)
+
+    def undelete(self, map_id: str, etag: str, request: RequestId | None) -> MapRecord:
+        """Take a deletion back.
+
+        Raises:
+            StateError: MAP_NOT_DELETED.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            record = find_map(connection, map_id)
+            if not record.is_deleted:
+                reason = "MAP_NOT_DELETED"
+                raise StateError(map_id, "a deleted map", "one that is not", reason=reason)
+            check_etag(record, etag)
+            return change_map(connection, record, {"delete_time_us": 0, "purge_time_us": 0})
+
+        return self._changed(request, act)
+
+    def purge(self, map_id: str, etag: str, request: RequestId | None) -> MapRecord:
+        """Forget a map for good, as it was last.
+
+        Raises:
+            StateError: MAP_IN_USE while a version is being made.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            record = find_map(connection, map_id)
+            check_etag(record, etag)
+            check_unused(connection, map_id)
+            forget_map(connection, map_id)
+            return record
+
+        return self._changed(request, act)
+
+    def promote(
+        self,
+        map_id: str,
+        label: int | str,
+        alias: str,
+        max_alias_count: int,
+        *,
+        etag: str = "",
+        request: RequestId | None = None,
+    ) -> MapRecord:
+        """Let an alias name a version.
+
+        Raises:
+            StateError: MAP_DELETED, or MAP_NOT_ACTIVE for a version that is not complete.
+            LimitError: TOO_MANY_ALIASES.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            record = get_current_map(connection, map_id, etag)
+            version = get_version(connection, record, label)
+            check_state(version, (VersionState.ACTIVE,))
+            chosen = {name for name in record.aliases if name != LATEST}
+            if alias not in chosen and len(chosen) >= max_alias_count:
+                expected = f"at most {max_alias_count} aliases of a map"
+                found = f"{len(chosen) + 1}"
+                raise LimitError(map_id, expected, found, reason="TOO_MANY_ALIASES")
+            set_alias(connection, map_id, alias, version.version)
+            change_map(connection, record, {})
+            return find_map(connection, map_id)
+
+        return self._changed(request, act)
+
+    def version(self, map_id: str, label: int | str) -> MapVersionRecord:
+        """One version by its number or an alias; raises `NotFoundError`, `StateError` MAP_DELETED."""
         with self._database.read() as connection:
-            number = version or _latest_version(connection, map_id)
-            query = select(MAP_VERSION).where(
-                MAP_VERSION.c.map_id == map_id, MAP_VERSION.c.version == number
-            )
-            row = connection.execute(query).mappings().one_or_none()
-        if row is None:
-            raise NotFoundError("map version", "an existing one", f"{map_id} v{number}")
-        return map_version_from_row(row)
+            return get_version(connection, get_map(connection, map_id), label)
 
     def version_page(self, map_id: str, after_version: int, limit: int) -> list[MapVersionRecord]:
-        """Versions above `after_version`, oldest first; raises `NotFoundError`."""
+        """Versions above `after_version`, oldest first; raises as `version`."""
         query = select(MAP_VERSION).where(
             MAP_VERSION.c.map_id == map_id, MAP_VERSION.c.version > after_version
         )
@@ -82,34 +214,51 @@ class Maps:
             rows = connection.execute(query.order_by(MAP_VERSION.c.version).limit(limit))
             return [map_version_from_row(row) for row in rows.mappings()]
 
+    def delete_version(
+        self, map_id: str, label: int | str, request: RequestId | None
+    ) -> MapVersionRecord:
+        """Delete a version.
+
+        Raises:
+            StateError: MAP_DELETED; MAP_IN_USE while it is being made; VERSION_HAS_ALIAS;
+                MAP_NOT_ACTIVE when it is deleted already.
+        """
+
+        def act(connection: Connection) -> MapVersionRecord:
+            record = get_map(connection, map_id)
+            version = get_version(connection, record, label)
+            check_state(version, (*USABLE, VersionState.CREATING, VersionState.FAILED))
+            check_unused(connection, map_id, version.version)
+            aliases = {name for name in record.aliases if record.aliases[name] == version.version}
+            if aliases - {LATEST}:
+                subject = f"{map_id} v{version.version}"
+                found = ", ".join(sorted(aliases - {LATEST}))
+                reason = "VERSION_HAS_ALIAS"
+                raise StateError(subject, "a version without alias", found, reason=reason)
+            purge_time_us = now_us() + DELETED_MAP_RETENTION_DAYS * DAY_US
+            changes = {"state": VersionState.DELETED, "purge_time_us": purge_time_us}
+            return change_version(connection, version, changes)
+
+        with self._database.write() as connection:
+            return once(connection, request, _VERSION_MEMORY, partial(act, connection))
+
     def map_file(self, record: MapVersionRecord) -> bytes:
         """The map file of a usable version; raises `StateError` MAP_NOT_ACTIVE."""
-        if not record.state.is_usable:
-            subject = f"{record.map_id} v{record.version}"
-            found = record.state.value
-            raise StateError(subject, "a usable version", found, reason="MAP_NOT_ACTIVE")
+        check_state(record, USABLE)
         return self._blobs.read(record.sha256)
 
+    def forget_deleted(self) -> None:
+        """Forget maps and versions whose time has come; their blobs are left to the sweep."""
+        now = now_us()
+        with self._database.write() as connection:
+            gone = select(MAP.c.id).where(MAP.c.purge_time_us.between(1, now))
+            for map_id in connection.scalars(gone).all():
+                forget_map(connection, map_id)
+            versions = MAP_VERSION.c.purge_time_us.between(1, now)
+            connection.execute(delete(MAP_VERSION).where(versions))
 
-def get_map(connection: Connection, map_id: str) -> MapRecord:
-    """One map; raises `NotFoundError`."""
-    row = connection.execute(select(MAP).where(MAP.c.id == map_id)).mappings().one_or_none()
-    if row is None:
-        raise NotFoundError("map", "an existing one", map_id)
-    return map_from_row(row)
-
-
-def _latest_version(connection: Connection, map_id: str) -> int:
-    query = select(func.max(MAP_VERSION.c.version)).where(
-        MAP_VERSION.c.map_id == map_id, MAP_VERSION.c.state == VersionState.ACTIVE.value
-    )
-    number = connection.execute(query).scalar_one()
-    if number is None:
-        raise NotFoundError("map version", f"an active version of {map_id}", "none")
-    return int(number)
-
-
-def _is_in_use(connection: Connection, map_id: str) -> bool:
-    unfinished = OPERATION.c.state.in_([state.value for state in UNFINISHED])
-    query = select(exists().where(OPERATION.c.map_id == map_id, unfinished))
-    return bool(connection.execute(query).scalar_one())
+    def _changed(
+        self, request: RequestId | None, act: Callable[[Connection], MapRecord]
+    ) -> MapRecord:
+        with self._database.write() as connection:
+            return once(connection, request, _MAP_MEMORY, partial(act, connection))

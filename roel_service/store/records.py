@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -12,6 +13,9 @@ from typing import Any
 from sqlalchemy import RowMapping
 
 from roel_service.scene.camera import Camera, CameraModel
+
+# Columns and their values, from the database or remembered as a text.
+Row = Mapping[str, Any] | RowMapping
 
 
 class StreamState(Enum):
@@ -28,10 +32,14 @@ class VersionState(Enum):
     PREVIEW = "preview"
     ACTIVE = "active"
     FAILED = "failed"
+    DELETED = "deleted"
 
     @property
     def is_usable(self) -> bool:
-        return self in (VersionState.PREVIEW, VersionState.ACTIVE)
+        return self in USABLE
+
+
+USABLE = (VersionState.PREVIEW, VersionState.ACTIVE)
 
 
 class OperationMethod(Enum):
@@ -86,21 +94,47 @@ class EventStreamRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class MapRecord:
-    """A named map; its versions are 1 to `version_count`."""
+    """A named map; its versions are 1 to `version_count`.
+
+    Attributes:
+        uid: chosen by the server, never used again.
+        aliases: number of the version that each one names, with `latest`, the newest usable one.
+        revision: grows with every change that a caller makes.
+        delete_time_us, purge_time_us: when it was deleted and will be forgotten; 0 while it lives.
+    """
 
     id: str
+    uid: str
     version_count: int
+    display_name: str
+    labels: dict[str, str]
+    aliases: dict[str, int]
+    revision: int
     create_time_us: int
+    update_time_us: int
+    delete_time_us: int
+    purge_time_us: int
+
+    @property
+    def etag(self) -> str:
+        return f"{self.uid[:8]}-{self.revision}"
+
+    @property
+    def is_deleted(self) -> bool:
+        return self.delete_time_us != 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapVersionRecord:
-    """One version; all from `sha256` to `report` are empty until it is ACTIVE.
+    """One version; all from `sha256` to `report` are empty until it is usable.
 
     Attributes:
         sha256, size_bytes: of the map file.
         bounds_m: lower corner, then upper corner, 6 numbers.
-        report: of the build, as the command line prints it.
+        report: of the build, as the command line prints it; empty if it was imported.
+        imported_file: what it was read from; empty if it was built.
+        provenance: what the map was made of.
+        purge_time_us: when a deleted version will be forgotten; 0 for any other.
     """
 
     map_id: str
@@ -114,6 +148,9 @@ class MapVersionRecord:
     bounds_m: list[float]
     report: dict[str, Any]
     create_time_us: int
+    imported_file: dict[str, Any] = dataclasses.field(default_factory=dict)
+    provenance: dict[str, str] = dataclasses.field(default_factory=dict)
+    purge_time_us: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,24 +253,20 @@ def stored(values: dict[str, Any]) -> dict[str, Any]:
     return {name: _stored(value) for name, value in values.items()}
 
 
-def event_stream_from_row(row: RowMapping) -> EventStreamRecord:
+def event_stream_from_row(row: Row) -> EventStreamRecord:
     """The inverse of `row_from_record`."""
     camera = _camera_from_json(row["camera"])
     return EventStreamRecord(**{**row, "state": StreamState(row["state"]), "camera": camera})
 
 
-def map_from_row(row: RowMapping) -> MapRecord:
+def map_version_from_row(row: Row) -> MapVersionRecord:
     """The inverse of `row_from_record`."""
-    return MapRecord(**row)
-
-
-def map_version_from_row(row: RowMapping) -> MapVersionRecord:
-    """The inverse of `row_from_record`."""
-    parsed = {name: json.loads(row[name]) for name in ("bounds_m", "report")}
+    texts = ("bounds_m", "report", "imported_file", "provenance")
+    parsed = {name: json.loads(row[name]) for name in texts}
     return MapVersionRecord(**{**row, **parsed, "state": VersionState(row["state"])})
 
 
-def operation_from_row(row: RowMapping) -> OperationRecord:
+def operation_from_row(row: Row) -> OperationRecord:
     """The inverse of `row_from_record`."""
     states = {"state": OperationState(row["state"]), "method": OperationMethod(row["method"])}
     return OperationRecord(**{**row, **states})

@@ -65,6 +65,21 @@ MAP = Table(
     Column("id", String, primary_key=True),
     Column("version_count", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
+    Column("uid", String, nullable=False),
+    Column("display_name", String, nullable=False),
+    Column("labels", String, nullable=False),
+    Column("revision", BigInteger, nullable=False),
+    Column("update_time_us", BigInteger, nullable=False),
+    Column("delete_time_us", BigInteger, nullable=False),
+    Column("purge_time_us", BigInteger, nullable=False),
+)
+
+MAP_ALIAS = Table(
+    "map_alias",
+    METADATA,
+    Column("map_id", ForeignKey("map.id", ondelete="CASCADE"), primary_key=True),
+    Column("alias", String, primary_key=True),
+    Column("version", BigInteger, nullable=False),
 )
 
 MAP_VERSION = Table(
@@ -81,6 +96,9 @@ MAP_VERSION = Table(
     Column("bounds_m", String, nullable=False),
     Column("report", String, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
+    Column("imported_file", String, nullable=False),
+    Column("provenance", String, nullable=False),
+    Column("purge_time_us", BigInteger, nullable=False),
 )
 
 OPERATION = Table(
@@ -125,5 +143,17 @@ TASK = Table(
 
 Index("task_operation", TASK.c.operation_id)
 Index("task_state", TASK.c.state, TASK.c.not_before_us)
+REQUEST = Table(
+    "request",
+    METADATA,
+    Column("id", String, primary_key=True),
+    Column("content_sha256", String, nullable=False),
+    Column("result", String, nullable=False),
+    Column("expire_time_us", BigInteger, nullable=False),
+)
+
 Index("operation_state", OPERATION.c.state)
 Index("operation_expire_time", OPERATION.c.expire_time_us)
+Index("request_expire_time", REQUEST.c.expire_time_us)
+Index("map_purge_time", MAP.c.purge_time_us)
+Index("map_version_purge_time", MAP_VERSION.c.purge_time_us)

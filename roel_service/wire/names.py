@@ -11,7 +11,11 @@ LATEST = "latest"
 
 _ID = re.compile(r"[a-z][a-z0-9-]{2,62}")
 _OPERATION = re.compile(r"operations/([0-9a-f]{32})")
-_VERSION = re.compile(r"(.+)/versions/(?:v([1-9][0-9]{0,8})|latest)")
+_NUMBER = re.compile(r"v([1-9][0-9]{0,8})")
+_VERSION = re.compile(rf"(.+)/versions/(?:{_NUMBER.pattern}|({_ID.pattern}))")
+
+# A version of a map by its number, or by an alias.
+VersionLabel = int | str
 
 
 def checked_id(value: str, subject: str) -> str:
@@ -47,18 +51,26 @@ def map_id(name: str) -> str:
     return _id_below(name, f"{PROJECT}/maps/")
 
 
-def map_version_name(map_id: str, version: int | str) -> str:
-    """The name of a version, by its number or the alias `latest`."""
-    label = version if version == LATEST else f"v{version}"
+def map_version_name(map_id: str, version: VersionLabel) -> str:
+    """The name of a version, by its number or an alias."""
+    label = f"v{version}" if isinstance(version, int) else version
     return f"{map_name(map_id)}/versions/{label}"
 
 
-def map_version_id(name: str) -> tuple[str, int | None]:
-    """Map id and number in a version's name, None for `latest`; raises `InputError` otherwise."""
+def map_version_id(name: str) -> tuple[str, VersionLabel]:
+    """Map id and number, or alias, in a version's name; raises `InputError` for any other text."""
     match = _VERSION.fullmatch(name)
     if match is None:
-        raise _bad_name(name, f"{PROJECT}/maps/ID/versions/vNUMBER")
-    return map_id(match[1]), int(match[2]) if match[2] else None
+        raise _bad_name(name, f"{PROJECT}/maps/ID/versions/vNUMBER or an alias")
+    return map_id(match[1]), int(match[2]) if match[2] else match[3]
+
+
+def checked_alias(value: str) -> str:
+    """`value` if a caller may choose it as an alias; raises `InputError` ID_INVALID otherwise."""
+    if value == LATEST or _NUMBER.fullmatch(value):
+        expected = f"an alias other than {LATEST} and the numbers of versions"
+        raise InputError("alias", expected, repr(value), reason="ID_INVALID")
+    return checked_id(value, "alias")
 
 
 def operation_name(operation_id: str) -> str:

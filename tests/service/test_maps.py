@@ -1,5 +1,9 @@
+import uuid
+
 import pytest
 
+from roel_client import Client
+from roel_client.connection import Connection, Endpoint
 from roel_service.errors import (
     ConfigError,
     ConflictError,
@@ -162,14 +166,150 @@ def test_ids_are_checked_and_unique(client):
         client.create_map("../etc")
 
 
-def test_maps_are_listed_and_deleted(client, call, map_name):
-    listed = call("ListMaps", maps_pb2.ListMapsRequest(parent="projects/default"))
-    assert map_name in [item.name for item in listed.maps]
+def listed(call, **fields):
+    request = maps_pb2.ListMapsRequest(parent="projects/default", page_size=1000, **fields)
+    return {item.name: item for item in call("ListMaps", request).maps}
+
+
+def test_maps_are_listed_deleted_and_undeleted(client, call, map_name):
+    assert map_name in listed(call)
     client.delete_map(map_name)
+    assert map_name not in listed(call)
+    deleted = listed(call, show_deleted=True)[map_name]
+    assert deleted.purge_time.ToSeconds() - deleted.delete_time.ToSeconds() == 30 * 24 * 3600
+    with pytest.raises(StateError) as caught:
+        client.map_version(f"{map_name}/versions/latest")
+    assert caught.value.reason == "MAP_DELETED"
+    back = call("UndeleteMap", maps_pb2.UndeleteMapRequest(name=map_name, etag=deleted.etag))
+    assert not back.HasField("delete_time")
+    assert listed(call)[map_name] == back
+    with pytest.raises(StateError) as caught:
+        call("UndeleteMap", maps_pb2.UndeleteMapRequest(name=map_name))
+    assert caught.value.reason == "MAP_NOT_DELETED"
+
+
+def test_a_purged_map_is_gone(client, call, map_name):
+    client.delete_map(map_name)
+    client.delete_map(map_name, purge=True)
     with pytest.raises(NotFoundError):
         call("GetMap", maps_pb2.GetMapRequest(name=map_name))
     with pytest.raises(NotFoundError):
         client.delete_map(map_name)
+
+
+def test_names_and_labels_are_given_and_changed(call):
+    given = maps_pb2.Map(display_name="Kitchen", labels={"floor": "2"})
+    request = maps_pb2.CreateMapRequest(parent="projects/default", map_id=new_id(), map=given)
+    created = call("CreateMap", request)
+    assert (created.display_name, dict(created.labels)) == ("Kitchen", {"floor": "2"})
+    created.display_name, stale = "Old kitchen", created.etag
+    del created.labels["floor"]
+    changed = call(
+        "UpdateMap", maps_pb2.UpdateMapRequest(map=created, update_mask={"paths": ["display_name"]})
+    )
+    assert (changed.display_name, dict(changed.labels)) == ("Old kitchen", {"floor": "2"})
+    cleared = call(
+        "UpdateMap", maps_pb2.UpdateMapRequest(map=changed, update_mask={"paths": ["labels"]})
+    )
+    assert dict(cleared.labels) == {"floor": "2"}
+    changed.labels.clear()
+    changed.etag = ""
+    cleared = call(
+        "UpdateMap", maps_pb2.UpdateMapRequest(map=changed, update_mask={"paths": ["labels"]})
+    )
+    assert not cleared.labels
+    cleared.etag = stale
+    with pytest.raises(ConflictError) as caught:
+        call("UpdateMap", maps_pb2.UpdateMapRequest(map=cleared))
+    assert caught.value.reason == "ETAG_MISMATCH"
+
+
+@pytest.mark.parametrize(
+    ("given", "mask", "subject"),
+    [
+        (maps_pb2.Map(display_name="x" * 201), [], "display_name"),
+        (maps_pb2.Map(display_name="a\nb"), [], "display_name"),
+        (maps_pb2.Map(labels={"Upper": "x"}), [], "labels"),
+        (maps_pb2.Map(labels={"key": "x" * 64}), [], "labels.key"),
+        (maps_pb2.Map(labels={f"k{i}": "" for i in range(65)}), [], "labels"),
+        (maps_pb2.Map(), ["version_count"], "update_mask"),
+    ],
+)
+def test_what_cannot_be_changed_is_refused(call, map_name, given, mask, subject):
+    given.name = map_name
+    request = maps_pb2.UpdateMapRequest(map=given, update_mask={"paths": mask})
+    with pytest.raises(InputError) as caught:
+        call("UpdateMap", request)
+    assert caught.value.subject == subject
+
+
+def test_a_version_is_found_by_any_of_its_aliases(client, call, map_name, stream):
+    for _ in range(2):
+        client.build_map(map_name, stream, config_of(QUICK)).wait()
+
+    def promote(version, alias):
+        name = f"{map_name}/versions/{version}"
+        return call("PromoteMapVersion", maps_pb2.PromoteMapVersionRequest(name=name, alias=alias))
+
+    assert dict(promote("v2", "live").aliases) == {"live": "v2", "latest": "v2"}
+    assert dict(promote("v1", "live").aliases) == {"live": "v1", "latest": "v2"}
+    assert client.map_version(f"{map_name}/versions/live").name == f"{map_name}/versions/v1"
+    with pytest.raises(StateError) as caught:
+        call(
+            "DeleteMapVersion",
+            maps_pb2.DeleteMapVersionRequest(name=f"{map_name}/versions/v1"),
+        )
+    assert caught.value.reason == "VERSION_HAS_ALIAS"
+    deleted = call(
+        "DeleteMapVersion", maps_pb2.DeleteMapVersionRequest(name=f"{map_name}/versions/v2")
+    )
+    assert deleted.state == maps_pb2.MapVersion.STATE_DELETED
+    assert deleted.HasField("purge_time")
+    assert client.map_version(f"{map_name}/versions/latest").name == f"{map_name}/versions/v1"
+    with pytest.raises(InputError) as caught:
+        promote("v1", "latest")
+    assert caught.value.reason == "ID_INVALID"
+
+
+def test_the_same_request_id_twice_changes_once(call):
+    request = maps_pb2.CreateMapRequest(
+        parent="projects/default", map_id=new_id(), request_id=str(uuid.uuid4())
+    )
+    first = call("CreateMap", request)
+    assert call("CreateMap", request) == first
+    request.map_id = new_id()
+    with pytest.raises(InputError) as reused:
+        call("CreateMap", request)
+    assert reused.value.reason == "REQUEST_ID_REUSED"
+    request.request_id = "not a uuid"
+    with pytest.raises(InputError) as invalid:
+        call("CreateMap", request)
+    assert invalid.value.reason == "REQUEST_ID_INVALID"
+
+
+def test_a_page_token_survives_a_restart_and_fits_its_list_alone(start_server):
+    server = start_server()
+    with Client(server.address) as client:
+        names = sorted(client.create_map(new_id()) for _ in range(3))
+        first = list_maps(server.address, page_size=2)
+    assert server.stop() == 0
+    server = start_server(port=server.port)
+    rest = list_maps(server.address, page_size=2, page_token=first.next_page_token)
+    assert [item.name for item in (*first.maps, *rest.maps)] == names
+    assert rest.next_page_token == ""
+    with pytest.raises(InputError) as caught:
+        list_maps(server.address, page_token=first.next_page_token, show_deleted=True)
+    assert caught.value.reason == "PAGE_TOKEN_INVALID"
+
+
+def list_maps(address, **fields):
+    connection = Connection(Endpoint(address=address))
+    stub = maps_pb2_grpc.MapServiceStub(connection.channel)
+    try:
+        request = maps_pb2.ListMapsRequest(parent="projects/default", **fields)
+        return connection.call(stub.ListMaps, request)
+    finally:
+        connection.close()
 
 
 def test_what_a_build_uses_cannot_be_deleted(client, map_name):

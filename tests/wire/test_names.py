@@ -15,8 +15,9 @@ def test_names_give_back_their_ids(resource_id, version):
     assert names.map_id(names.map_name(resource_id)) == resource_id
     numbered = names.map_version_name(resource_id, version)
     assert names.map_version_id(numbered) == (resource_id, version)
-    latest = names.map_version_name(resource_id, names.LATEST)
-    assert names.map_version_id(latest) == (resource_id, None)
+    for alias in (names.LATEST, "live"):
+        named = names.map_version_name(resource_id, alias)
+        assert names.map_version_id(named) == (resource_id, alias)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +37,7 @@ def test_other_ids_are_refused(bad):
         (names.event_stream_id, "abc"),
         (names.map_id, "projects/default/maps/../x"),
         (names.map_version_id, "projects/default/maps/abc/versions/v0"),
-        (names.map_version_id, "projects/default/maps/abc/versions/newest"),
+        (names.map_version_id, "projects/default/maps/abc/versions/Newest"),
         (names.map_version_id, "projects/default/maps/abc"),
         (names.operation_id, "operations/1"),
         (names.operation_id, "operations/" + "g" * 32),
@@ -53,3 +54,11 @@ def test_there_is_one_project():
     names.check_parent("projects/default")
     with pytest.raises(NotFoundError):
         names.check_parent("projects/other")
+
+
+@pytest.mark.parametrize("alias", ["latest", "v1", "v123", "ab", "Live", ""])
+def test_an_alias_is_an_id_but_neither_latest_nor_a_number(alias):
+    assert names.checked_alias("live") == "live"
+    with pytest.raises(InputError) as caught:
+        names.checked_alias(alias)
+    assert caught.value.reason == "ID_INVALID"

@@ -14,6 +14,7 @@ from roel_service.store.migrations import (
     m001_first_tables,
     m002_methods_of_operations,
     m003_tasks,
+    m004_maps_and_requests,
 )
 
 # Step k leads from version k to k + 1.
@@ -21,6 +22,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m001_first_tables.migrate,
     m002_methods_of_operations.migrate,
     m003_tasks.migrate,
+    m004_maps_and_requests.migrate,
 )
 
 

@@ -1,0 +1,151 @@
+"""Rows of maps and their versions, within a transaction of the caller."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import Connection, RowMapping, delete, exists, func, insert, select, update
+
+from roel_service.errors import ConflictError, NotFoundError, StateError
+from roel_service.store.records import (
+    UNFINISHED,
+    USABLE,
+    MapRecord,
+    MapVersionRecord,
+    VersionState,
+    map_version_from_row,
+    now_us,
+    row_from_record,
+    stored,
+)
+from roel_service.store.schema import MAP, MAP_ALIAS, MAP_VERSION, OPERATION
+
+# The alias that nobody sets: the newest usable version.
+LATEST = "latest"
+
+
+def get_map(connection: Connection, map_id: str) -> MapRecord:
+    """One map that lives; raises `NotFoundError`, or `StateError` MAP_DELETED."""
+    record = find_map(connection, map_id)
+    if record.is_deleted:
+        expected = "a map that is not deleted"
+        raise StateError(map_id, expected, "one that is", reason="MAP_DELETED")
+    return record
+
+
+def find_map(connection: Connection, map_id: str) -> MapRecord:
+    """One map, also a deleted one; raises `NotFoundError`."""
+    rows = connection.execute(select(MAP).where(MAP.c.id == map_id)).mappings().all()
+    if not rows:
+        raise NotFoundError("map", "an existing one", map_id)
+    return map_records(connection, rows)[0]
+
+
+def map_records(connection: Connection, rows: Sequence[RowMapping]) -> list[MapRecord]:
+    """Rows of maps, in the order of their ids, with the aliases that all of them have."""
+    if not rows:
+        return []
+    aliases: dict[str, dict[str, int]] = {row["id"]: {} for row in rows}
+    first, last = rows[0]["id"], rows[-1]["id"]
+    chosen = select(MAP_ALIAS.c.map_id, MAP_ALIAS.c.alias, MAP_ALIAS.c.version)
+    newest = select(MAP_VERSION.c.map_id, func.max(MAP_VERSION.c.version)).where(
+        MAP_VERSION.c.map_id.between(first, last),
+        MAP_VERSION.c.state.in_([state.value for state in USABLE]),
+    )
+    for map_id, alias, version in connection.execute(
+        chosen.where(MAP_ALIAS.c.map_id.between(first, last)).order_by(MAP_ALIAS.c.alias)
+    ):
+        aliases.get(map_id, {})[alias] = version
+    for map_id, version in connection.execute(newest.group_by(MAP_VERSION.c.map_id)):
+        aliases.get(map_id, {})[LATEST] = version
+    return [
+        MapRecord(**{**row, "labels": json.loads(row["labels"]), "aliases": aliases[row["id"]]})
+        for row in rows
+    ]
+
+
+def get_version(connection: Connection, record: MapRecord, label: int | str) -> MapVersionRecord:
+    """One version by its number or an alias; raises `NotFoundError`."""
+    number = label if isinstance(label, int) else record.aliases.get(label, 0)
+    query = select(MAP_VERSION).where(
+        MAP_VERSION.c.map_id == record.id, MAP_VERSION.c.version == number
+    )
+    row = connection.execute(query).mappings().one_or_none()
+    if row is None:
+        shown = f"v{label}" if isinstance(label, int) else label
+        raise NotFoundError("map version", "an existing one", f"{record.id} {shown}")
+    return map_version_from_row(row)
+
+
+def insert_map(connection: Connection, record: MapRecord) -> MapRecord:
+    """A new map; raises `ConflictError` ALREADY_EXISTS."""
+    if connection.execute(select(exists().where(MAP.c.id == record.id))).scalar_one():
+        raise ConflictError("map", "an id not in use", record.id, reason="ALREADY_EXISTS")
+    row = row_from_record(record)
+    del row["aliases"]
+    connection.execute(insert(MAP), row)
+    return record
+
+
+def change_map(connection: Connection, record: MapRecord, values: dict[str, Any]) -> MapRecord:
+    """Change fields on a caller's behalf: the map gets a new etag."""
+    changes = {**values, "revision": record.revision + 1, "update_time_us": now_us()}
+    connection.execute(update(MAP).where(MAP.c.id == record.id).values(stored(changes)))
+    return dataclasses.replace(record, **changes)
+
+
+def forget_map(connection: Connection, map_id: str) -> None:
+    """Delete a map with its versions, aliases and operations."""
+    connection.execute(delete(OPERATION).where(OPERATION.c.map_id == map_id))
+    connection.execute(delete(MAP).where(MAP.c.id == map_id))
+
+
+def get_current_map(connection: Connection, map_id: str, etag: str) -> MapRecord:
+    """One map that lives and has the etag; raises as `get_map` and `check_etag`."""
+    record = get_map(connection, map_id)
+    check_etag(record, etag)
+    return record
+
+
+def check_etag(record: MapRecord, etag: str) -> None:
+    """Raise `ConflictError` ETAG_MISMATCH unless the etag is empty or the map's own."""
+    if etag and etag != record.etag:
+        raise ConflictError("etag", record.etag, etag, reason="ETAG_MISMATCH")
+
+
+def check_state(version: MapVersionRecord, wanted: Sequence[VersionState]) -> None:
+    """Raise `StateError` MAP_NOT_ACTIVE for a version in another state."""
+    if version.state not in wanted:
+        subject = f"{version.map_id} v{version.version}"
+        expected = "a usable version"
+        raise StateError(subject, expected, version.state.value, reason="MAP_NOT_ACTIVE")
+
+
+def check_unused(connection: Connection, map_id: str, version: int | None = None) -> None:
+    """Raise `StateError` MAP_IN_USE while a version of the map, or just this one, is being made."""
+    unfinished = OPERATION.c.state.in_([state.value for state in UNFINISHED])
+    of_map = (OPERATION.c.map_id == map_id) & unfinished
+    if version is not None:
+        of_map &= OPERATION.c.version == version
+    if connection.execute(select(exists().where(of_map))).scalar_one():
+        raise StateError(map_id, "no version being made", "one", reason="MAP_IN_USE")
+
+
+def set_alias(connection: Connection, map_id: str, alias: str, version: int) -> None:
+    """Let an alias name a version, whatever it named before."""
+    key = (MAP_ALIAS.c.map_id == map_id) & (MAP_ALIAS.c.alias == alias)
+    connection.execute(delete(MAP_ALIAS).where(key))
+    row = {"map_id": map_id, "alias": alias, "version": version}
+    connection.execute(insert(MAP_ALIAS), row)
+
+
+def change_version(
+    connection: Connection, version: MapVersionRecord, changes: dict[str, Any]
+) -> MapVersionRecord:
+    """Change fields of a version."""
+    key = (MAP_VERSION.c.map_id == version.map_id) & (MAP_VERSION.c.version == version.version)
+    connection.execute(update(MAP_VERSION).where(key).values(stored(changes)))
+    return dataclasses.replace(version, **changes)
