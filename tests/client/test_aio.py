@@ -47,7 +47,7 @@ def test_builds_run_side_by_side(server):
 def test_what_goes_wrong_there_is_raised_here(server):
     with pytest.raises(RoelError) as caught:
         run(server.address, lambda client: map_with(client, BUG))
-    assert caught.value.reason == "INTERNAL"
+    assert caught.value.reason == "POISONED"
 
 
 def test_an_error_of_the_source_is_raised_as_it_is(server):
