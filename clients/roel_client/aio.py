@@ -17,9 +17,10 @@ from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_client.connection import AsyncConnection, Endpoint, Tls
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
+from roel_client.uploads import EventUpload
 from roel_service.config.stages import Config
 from roel_service.errors import CorruptionError, RoelError
-from roel_service.progress import Progress, ProgressCallback, ignore
+from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.trajectory import Trajectory
@@ -35,7 +36,6 @@ from roel_service.v1 import (
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 from roel_service.wire import names
-from roel_service.wire.chunks import encode_chunk, split_chunks
 from roel_service.wire.configs import config_to_proto
 from roel_service.wire.errors import error_from_status
 from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
@@ -132,8 +132,19 @@ class AsyncClient:
     async def upload_events(
         self, stream: str, source: EventSource, progress: ProgressCallback = ignore
     ) -> events_pb2.EventStream:
-        """Append a whole source; a broken upload is taken up where the server's record ends."""
-        return await _resumed(lambda: self._append_events(stream, source, progress))
+        """Append a whole source; a broken upload is taken up where the server's record ends.
+
+        A recording that holds events already is taken to hold the first ones of this source.
+        Progress tells how many events are durable.
+        """
+        upload = EventUpload(source, progress)
+        try:
+            await _resumed(
+                lambda: self._append_events(stream, upload), lambda: upload.committed_seq
+            )
+        finally:
+            await self._connection.run(upload.close)
+        return await self.event_stream(stream)
 
     async def upload_poses(self, stream: str, trajectory: Trajectory) -> events_pb2.EventStream:
         """Append poses."""
@@ -195,12 +206,17 @@ class AsyncClient:
         request = maps_pb2.DeleteMapRequest(name=name, purge=purge)
         await self._connection.call(self._maps.DeleteMap, request)
 
-    async def _append_events(
-        self, stream: str, source: EventSource, progress: ProgressCallback
-    ) -> events_pb2.EventStream:
-        record = await self.event_stream(stream)
-        requests = _event_requests(stream, source, record.chunk_count, progress)
-        return await self._connection.upload(self._streams.AppendEvents, requests)
+    async def _append_events(self, stream: str, upload: EventUpload) -> None:
+        async with self._connection.exchange(self._streams.AppendEvents) as exchange:
+            await exchange.send(events_pb2.AppendEventsRequest(event_stream=stream))
+            upload.restart(await exchange.receive())
+            while (chunk := await self._connection.run(upload.next_chunk)) is not None:
+                while not upload.has_credit(chunk):
+                    upload.acknowledge(await exchange.receive())
+                await exchange.send(chunk.request())
+            await exchange.finish()
+            while (status := await exchange.receive()) is not None:
+                upload.acknowledge(status)
 
     @contextlib.asynccontextmanager
     async def _temporary_stream(self, camera: Camera) -> AsyncIterator[str]:
@@ -276,20 +292,6 @@ class AsyncOperation:
         raise RoelError(self.name, "an operation that ends", "a watch that ended before it")
 
 
-def _event_requests(
-    stream: str, source: EventSource, first_seq: int, progress: ProgressCallback
-) -> Iterator[events_pb2.AppendEventsRequest]:
-    yield events_pb2.AppendEventsRequest(event_stream=stream)
-    event_count = 0
-    for seq, events in enumerate(split_chunks(source)):
-        event_count += len(events)
-        if seq >= first_seq:
-            chunk = events_pb2.EventChunk(seq=seq, data=encode_chunk(events))
-            yield events_pb2.AppendEventsRequest(chunk=chunk)
-        told = Progress(stage="upload", done_count=event_count, total_count=0, fraction=0.0)
-        progress(told)
-
-
 def _pose_requests(stream: str, trajectory: Trajectory) -> Iterator[events_pb2.AppendPosesRequest]:
     yield events_pb2.AppendPosesRequest(event_stream=stream)
     columns = trajectory_to_proto(trajectory)
@@ -307,17 +309,24 @@ def _pose_part(columns: types_pb2.Trajectory, start: int) -> types_pb2.Trajector
     )
 
 
-async def _resumed(call: Callable[[], Awaitable[Result]]) -> Result:
+async def _resumed(
+    call: Callable[[], Awaitable[Result]], position: Callable[[], int] = lambda: 0
+) -> Result:
     """Result of a call that continues where it broke.
+
+    Args:
+        position: how far the calls came; the pauses begin anew when that was further than before.
 
     Raises:
         UnavailableError: the server stayed unavailable.
     """
-    attempts = Attempts(RESUMING)
+    attempts, reached = Attempts(RESUMING), position()
     while True:
         try:
             return await call()
         except RoelError as error:
+            if position() > reached:
+                attempts, reached = Attempts(RESUMING), position()
             await asyncio.sleep(attempts.pause_s(error))
 
 

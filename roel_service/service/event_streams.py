@@ -8,16 +8,16 @@ from typing import Any
 
 from google.protobuf.empty_pb2 import Empty
 
-from roel_service.errors import EventsError, InputError, LimitError, TrajectoryError
-from roel_service.scene.camera import Camera
+from roel_service.errors import InputError, LimitError, TrajectoryError
+from roel_service.service.append import EventSink, request_part
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
 from roel_service.service.settings import Settings
-from roel_service.store.event_streams import Chunk, EventStreams, PosePart
+from roel_service.service.uploads import OpenUploads, Upload, next_request
+from roel_service.store.event_streams import EventStreams, PosePart
 from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import events_pb2, types_pb2
 from roel_service.wire import names
-from roel_service.wire.chunks import decode_chunk
 from roel_service.wire.nouns import (
     camera_from_proto,
     trajectory_columns,
@@ -29,8 +29,9 @@ from roel_service.wire.nouns import (
 class EventStreamServicer:
     """Decodes requests, calls the store in a thread, encodes answers."""
 
-    def __init__(self, streams: EventStreams, settings: Settings) -> None:
+    def __init__(self, streams: EventStreams, uploads: OpenUploads, settings: Settings) -> None:
         self._streams = streams
+        self._uploads = uploads
         self._settings = settings
 
     async def CreateEventStream(
@@ -44,26 +45,32 @@ class EventStreamServicer:
 
     async def AppendEvents(
         self, requests: AsyncIterator[events_pb2.AppendEventsRequest], context: Any
-    ) -> events_pb2.EventStream:
-        stream_id = await _stream_id(requests)
+    ) -> AsyncIterator[events_pb2.AppendStatus]:
+        stream_id = await self._stream_id(requests)
+        record = await asyncio.to_thread(self._streams.take_over, stream_id)
+        sink = EventSink(self._streams, record, self._settings)
+        upload = Upload(requests, sink, self._settings)
+        with self._uploads.entered(stream_id, record.fence, upload):
+            yield await asyncio.to_thread(sink.status)
+            async for status in upload.statuses():
+                yield status
+
+    async def QueryAppendStatus(
+        self, request: events_pb2.QueryAppendStatusRequest, context: Any
+    ) -> events_pb2.AppendStatus:
+        stream_id = names.event_stream_id(request.name)
         record = await asyncio.to_thread(self._streams.get, stream_id)
-        pending: list[Chunk] = []
-        async for request in requests:
-            message = _part(request, "chunk").chunk
-            pending.append(await asyncio.to_thread(_checked_chunk, message, record.camera))
-            if sum(len(chunk.data) for chunk in pending) >= self._settings.commit_bytes:
-                record = await self._commit(stream_id, pending)
-                pending = []
-        return event_stream_to_proto(await self._commit(stream_id, pending))
+        sink = EventSink(self._streams, record, self._settings)
+        return await asyncio.to_thread(sink.status)
 
     async def AppendPoses(
         self, requests: AsyncIterator[events_pb2.AppendPosesRequest], context: Any
     ) -> events_pb2.EventStream:
-        stream_id = await _stream_id(requests)
+        stream_id = await self._stream_id(requests)
         parts: list[types_pb2.Trajectory] = []
         pose_count = 0
-        async for request in requests:
-            parts.append(_part(request, "poses").poses)
+        while (request := await next_request(requests, self._settings)) is not None:
+            parts.append(request_part(request, "poses"))
             pose_count += _checked_count(parts[-1])
             if pose_count > self._settings.pose_count:
                 expected = f"at most {self._settings.pose_count}"
@@ -100,9 +107,12 @@ class EventStreamServicer:
         await asyncio.to_thread(self._streams.delete, names.event_stream_id(request.name))
         return Empty()
 
-    async def _commit(self, stream_id: str, chunks: list[Chunk]) -> EventStreamRecord:
-        limit = self._settings.event_stream_bytes
-        return await asyncio.to_thread(self._streams.append_chunks, stream_id, chunks, limit)
+    async def _stream_id(self, requests: AsyncIterator[Any]) -> str:
+        """The recording that the first message of an upload names."""
+        request = await next_request(requests, self._settings)
+        if request is None:
+            raise InputError("upload", "a message that names the recording", "none")
+        return names.event_stream_id(request_part(request, "event_stream"))
 
     def _append_poses(self, stream_id: str, parts: list[types_pb2.Trajectory]) -> EventStreamRecord:
         trajectory = trajectory_from_proto(*parts)
@@ -110,23 +120,10 @@ class EventStreamServicer:
             t0_us=int(trajectory.t_us[0]),
             t1_us=int(trajectory.t_us[-1]),
             pose_count=len(trajectory),
+            covered_us=trajectory.covered_us().tolist(),
             data=trajectory_to_proto(trajectory).SerializeToString(deterministic=True),
         )
         return self._streams.append_poses(stream_id, part, self._settings.pose_count)
-
-
-async def _stream_id(requests: AsyncIterator[Any]) -> str:
-    """The recording that the first message of an upload names."""
-    async for request in requests:
-        return names.event_stream_id(_part(request, "event_stream").event_stream)
-    raise InputError("upload", "a message that names the recording", "none")
-
-
-def _part(request: Any, name: str) -> Any:
-    found = request.WhichOneof("part")
-    if found != name:
-        raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
-    return request
 
 
 def _checked_count(poses: types_pb2.Trajectory) -> int:
@@ -135,19 +132,3 @@ def _checked_count(poses: types_pb2.Trajectory) -> int:
     if len(t_us) == 0:
         raise TrajectoryError("poses", "at least one in every message", "none")
     return len(t_us)
-
-
-def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:
-    """Decode a chunk to know that it is sound; the order of chunks is the store's to check."""
-    events = decode_chunk(message.data, previous_t1_us=None)
-    if (events.width, events.height) != (camera.width, camera.height):
-        expected = f"events of a {camera.width}x{camera.height} sensor, as the camera's"
-        found = f"{events.width}x{events.height}"
-        raise EventsError(f"chunk {message.seq}", expected, found, reason="SENSOR_MISMATCH")
-    return Chunk(
-        seq=message.seq,
-        t0_us=int(events.t_us[0]),
-        t1_us=int(events.t_us[-1]),
-        event_count=len(events),
-        data=message.data,
-    )

@@ -13,6 +13,7 @@ from roel_service.service.maps import MapServicer
 from roel_service.service.methods import complete
 from roel_service.service.operations import OperationServicer
 from roel_service.service.settings import Settings
+from roel_service.service.uploads import OpenUploads
 from roel_service.store.store import Store
 from roel_service.v1 import (
     capabilities_pb2,
@@ -66,8 +67,9 @@ SERVICES = tuple(descriptor.full_name for descriptor in _DESCRIPTORS.values())
 def add_services(server: Any, store: Store, scheduler: Scheduler, settings: Settings) -> None:
     """Add every service of the protocol; methods that nobody wrote yet refuse."""
     operations = OperationServicer(store, scheduler)
+    uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
-        "EventStreamService": EventStreamServicer(store.event_streams, settings),
+        "EventStreamService": EventStreamServicer(store.event_streams, uploads, settings),
         "MapService": MapServicer(store, scheduler, settings),
         "OperationService": operations,
         "Operations": operations,

@@ -27,7 +27,11 @@ class Settings:
             tries again what needed more.
         task_time_s: wall clock of one attempt.
         retry_delay_s: mean time before a lost or broken attempt is tried again; it doubles.
-        commit_bytes: an upload is made durable at least this often.
+        append_credit_chunks: event chunks of a call that may be under way at a time.
+        open_uploads: uploads at a time.
+        upload_silence_s: an upload that sends nothing for this long is ended.
+        commit_interval_s, commit_bytes: what an upload sent is made durable when its first part is
+            this old, or when it is this much.
         download_part_bytes: size of the messages of a download.
         lines_per_message: most lines of a message of GetLines.
         label_count: most labels of a resource.
@@ -47,6 +51,10 @@ class Settings:
     retried_task_memory_bytes: int = 4 * GIB
     task_time_s: float = 3600.0
     retry_delay_s: float = 1.0
+    append_credit_chunks: int = 16
+    open_uploads: int = 64
+    upload_silence_s: float = 60.0
+    commit_interval_s: float = 0.02
     commit_bytes: int = 8 * MIB
     download_part_bytes: int = MIB
     lines_per_message: int = 100_000

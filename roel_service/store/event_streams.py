@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
+import itertools
+import json
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,10 @@ from roel_service.errors import (
     TrajectoryError,
 )
 from roel_service.scene.camera import Camera
+from roel_service.scene.trajectory import MAX_POSE_GAP_US
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
+from roel_service.store.locks import KeyedLocks
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import (
     UNFINISHED,
@@ -39,26 +42,34 @@ from roel_service.store.schema import EVENT_CHUNK, EVENT_STREAM, OPERATION, POSE
 
 @dataclass(frozen=True, kw_only=True)
 class Chunk:
-    """Events as they are stored; `data` has been decoded once and found sound."""
+    """Events as they are stored; `data` has been checked once and found sound.
+
+    Attributes:
+        longest_step_us: longest time between two neighbouring events of the chunk.
+        sha256: of `data`, hexadecimal.
+    """
 
     seq: int
     t0_us: int
     t1_us: int
     event_count: int
+    longest_step_us: int
     data: bytes
-
-    @property
-    def sha256(self) -> str:
-        return hashlib.sha256(self.data).hexdigest()
+    sha256: str
 
 
 @dataclass(frozen=True, kw_only=True)
 class PosePart:
-    """Poses as they are stored; `data` has been decoded once and found sound."""
+    """Poses as they are stored; `data` has been decoded once and found sound.
+
+    Attributes:
+        covered_us: first and last times between which poses are dense enough, in order.
+    """
 
     t0_us: int
     t1_us: int
     pose_count: int
+    covered_us: list[list[int]]
     data: bytes
 
 
@@ -69,6 +80,9 @@ class EventStreams:
         self._database = database
         self._blobs = blobs
         self._recordings = recordings
+        # Whoever changes the chunks of a recording holds its lock, so that the slow part, making a
+        # file durable, needs no transaction.
+        self._locks = KeyedLocks()
 
     def create(self, stream_id: str, camera: Camera) -> EventStreamRecord:
         """Open a recording; raises `ConflictError` ALREADY_EXISTS."""
@@ -84,6 +98,8 @@ class EventStreams:
             end_us=0,
             pose_count=0,
             digest="",
+            fence=0,
+            longest_gap_us=0,
             create_time_us=now_us(),
         )
         with self._database.write() as connection:
@@ -106,40 +122,49 @@ class EventStreams:
             rows = connection.execute(query.order_by(EVENT_STREAM.c.id).limit(limit)).mappings()
             return [event_stream_from_row(row) for row in rows]
 
+    def take_over(self, stream_id: str) -> EventStreamRecord:
+        """Become the one writer of a recording; whoever was it before can append no more.
+
+        Returns:
+            The recording; its fence is the writer's licence to append.
+
+        Raises:
+            StateError: STREAM_FINALIZED.
+        """
+        with self._locks.holding(stream_id), self._database.write() as connection:
+            record = _get_open(connection, stream_id)
+            return _update(connection, record, fence=record.fence + 1)
+
     def append_chunks(
-        self, stream_id: str, chunks: Sequence[Chunk], max_size_bytes: int
+        self, stream_id: str, fence: int, chunks: Sequence[Chunk], max_size_bytes: int
     ) -> EventStreamRecord:
         """Append chunks, all or none; those already stored are compared and left out.
 
+        Args:
+            fence: of the record that `take_over` gave.
+
         Raises:
             StateError: STREAM_FINALIZED, or SEQUENCE_GAP with the number that is expected.
-            ConflictError: CHUNK_CONFLICT, a stored chunk comes again with other bytes.
+            ConflictError: WRITER_REPLACED; CHUNK_CONFLICT, a stored chunk comes again with other
+                bytes.
             EventsError: a chunk that begins before the end of the one before it.
             LimitError: EVENT_STREAM_TOO_LARGE.
         """
-        with self._database.write() as connection:
-            record = _get_open(connection, stream_id)
-            fresh = [chunk for chunk in chunks if not _is_repeat(connection, record, chunk)]
+        with self._locks.holding(stream_id):
+            with self._database.read() as connection:
+                record = _get_writable(connection, stream_id, fence)
+                fresh = [chunk for chunk in chunks if not _is_repeat(connection, record, chunk)]
             if not fresh:
                 return record
             _check_order(record, fresh)
             rows = _chunk_rows(record, fresh)
-            size_bytes = rows[-1]["offset"] + rows[-1]["length"]
-            if size_bytes > max_size_bytes:
-                expected = f"at most {max_size_bytes} bytes of events"
-                reason = "EVENT_STREAM_TOO_LARGE"
-                raise LimitError("event stream", expected, f"{size_bytes}", reason=reason)
+            _check_size(rows[-1], max_size_bytes)
             self._recordings.append(record.uid, record.size_bytes, (chunk.data for chunk in fresh))
-            connection.execute(insert(EVENT_CHUNK), rows)
-            return _update(
-                connection,
-                record,
-                chunk_count=record.chunk_count + len(fresh),
-                event_count=record.event_count + sum(chunk.event_count for chunk in fresh),
-                size_bytes=size_bytes,
-                start_us=record.start_us if record.chunk_count else fresh[0].t0_us,
-                end_us=fresh[-1].t1_us,
-            )
+            with self._database.write() as connection:
+                connection.execute(insert(EVENT_CHUNK), rows)
+                # Poses may have come meanwhile; the chunks are still those of `record`.
+                current = _get(connection, stream_id)
+                return _update(connection, current, **_grown(record, fresh))
 
     def append_poses(
         self, stream_id: str, part: PosePart, max_pose_count: int
@@ -167,27 +192,30 @@ class EventStreams:
                 "pose_count": part.pose_count,
                 "t0_us": part.t0_us,
                 "t1_us": part.t1_us,
+                "covered_us": part.covered_us,
                 "sha256": self._blobs.put(part.data),
             }
-            connection.execute(insert(POSE_PART), row)
+            connection.execute(insert(POSE_PART), stored(row))
             return _update(connection, record, pose_count=pose_count)
 
     def finalize(self, stream_id: str) -> EventStreamRecord:
         """Freeze a recording and seal its events into a blob; raises `EventsError` NO_EVENTS."""
-        with self._database.write() as connection:
-            record = _get(connection, stream_id)
+        with self._locks.holding(stream_id):
+            record = self.get(stream_id)
             if record.state is StreamState.FINALIZED:
                 return record
             if record.event_count == 0:
                 raise EventsError(stream_id, "events", "none", reason="NO_EVENTS")
             digest = self._blobs.adopt(self._recordings.cut(record.uid, record.size_bytes))
-            sealed = _update(connection, record, state=StreamState.FINALIZED, digest=digest)
-        self._recordings.delete(record.uid)
-        return sealed
+            with self._database.write() as connection:
+                current = _get(connection, stream_id)
+                sealed = _update(connection, current, state=StreamState.FINALIZED, digest=digest)
+            self._recordings.delete(record.uid)
+            return sealed
 
     def delete(self, stream_id: str) -> None:
         """Forget a recording; raises `StateError` STREAM_IN_USE while a build reads it."""
-        with self._database.write() as connection:
+        with self._locks.holding(stream_id), self._database.write() as connection:
             record = _get(connection, stream_id)
             if _is_in_use(connection, stream_id):
                 raise StateError(stream_id, "no build", "one at work", reason="STREAM_IN_USE")
@@ -212,11 +240,19 @@ class EventStreams:
         with self._database.read() as connection:
             return [self._blobs.path(row["sha256"]) for row in _pose_rows(connection, record.uid)]
 
-    def open_uids(self) -> set[str]:
-        """Recordings that still have an append file."""
-        query = select(EVENT_STREAM.c.uid).where(EVENT_STREAM.c.state == StreamState.OPEN.value)
+    def covered_us(self, record: EventStreamRecord) -> list[list[int]]:
+        """First and last times between which poses are dense enough, in order."""
         with self._database.read() as connection:
-            return set(connection.scalars(query))
+            return _joined(_covered_us(row) for row in _pose_rows(connection, record.uid))
+
+    def recover(self) -> None:
+        """Cut append files to what was committed, and delete those of no open recording."""
+        query = select(EVENT_STREAM.c.uid, EVENT_STREAM.c.size_bytes).where(
+            EVENT_STREAM.c.state == StreamState.OPEN.value
+        )
+        with self._database.read() as connection:
+            committed_bytes = {row.uid: row.size_bytes for row in connection.execute(query)}
+        self._recordings.sweep(committed_bytes)
 
 
 def get_finalized(connection: Connection, stream_id: str) -> EventStreamRecord:
@@ -248,6 +284,18 @@ def _get_open(connection: Connection, stream_id: str) -> EventStreamRecord:
     return record
 
 
+def _get_writable(connection: Connection, stream_id: str, fence: int) -> EventStreamRecord:
+    record = _get_open(connection, stream_id)
+    if record.fence != fence:
+        raise writer_replaced(stream_id)
+    return record
+
+
+def writer_replaced(subject: str) -> ConflictError:
+    """The error for a writer whose recording or upload another one took over."""
+    return ConflictError(subject, "one writer", "another that took over", reason="WRITER_REPLACED")
+
+
 def _update(connection: Connection, record: EventStreamRecord, **values: Any) -> EventStreamRecord:
     row = update(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid)
     connection.execute(row.values(stored(values)))
@@ -271,7 +319,7 @@ def _check_order(record: EventStreamRecord, chunks: Sequence[Chunk]) -> None:
     end_us = record.end_us if record.chunk_count else chunks[0].t0_us
     for seq, chunk in enumerate(chunks, start=record.chunk_count):
         if chunk.seq != seq:
-            raise StateError("chunk", f"seq {seq}", f"seq {chunk.seq}", reason="SEQUENCE_GAP")
+            raise StateError("seq", f"{seq}", f"{chunk.seq}", reason="SEQUENCE_GAP")
         if chunk.t0_us < end_us:
             expected = f"events from {end_us} us on"
             reason = "EVENT_TIME_NOT_MONOTONE"
@@ -296,6 +344,46 @@ def _chunk_rows(record: EventStreamRecord, chunks: Sequence[Chunk]) -> list[dict
         rows.append(row)
         offset += len(chunk.data)
     return rows
+
+
+def _check_size(last_row: dict[str, Any], max_size_bytes: int) -> None:
+    size_bytes = last_row["offset"] + last_row["length"]
+    if size_bytes > max_size_bytes:
+        expected = f"at most {max_size_bytes} bytes of events"
+        reason = "EVENT_STREAM_TOO_LARGE"
+        raise LimitError("event stream", expected, f"{size_bytes}", reason=reason)
+
+
+def _grown(record: EventStreamRecord, chunks: Sequence[Chunk]) -> dict[str, int]:
+    """What changes in a record when chunks are appended."""
+    ends_us = [record.end_us if record.chunk_count else chunks[0].t0_us]
+    ends_us += [chunk.t1_us for chunk in chunks]
+    pauses_us = [chunk.t0_us - end_us for chunk, end_us in zip(chunks, ends_us, strict=False)]
+    steps_us = [chunk.longest_step_us for chunk in chunks]
+    return {
+        "chunk_count": record.chunk_count + len(chunks),
+        "event_count": record.event_count + sum(chunk.event_count for chunk in chunks),
+        "size_bytes": record.size_bytes + sum(len(chunk.data) for chunk in chunks),
+        "start_us": record.start_us if record.chunk_count else chunks[0].t0_us,
+        "end_us": chunks[-1].t1_us,
+        "longest_gap_us": max(record.longest_gap_us, *steps_us, *pauses_us),
+    }
+
+
+def _covered_us(row: RowMapping) -> list[list[int]]:
+    """Of one pose part; parts of older releases do not tell, and count as dense."""
+    return json.loads(row["covered_us"]) or [[row["t0_us"], row["t1_us"]]]
+
+
+def _joined(parts: Iterable[list[list[int]]]) -> list[list[int]]:
+    """Spans of all parts; neighbours that no gap divides become one."""
+    joined: list[list[int]] = []
+    for first_us, last_us in itertools.chain.from_iterable(parts):
+        if joined and first_us - joined[-1][1] <= MAX_POSE_GAP_US:
+            joined[-1][1] = last_us
+        else:
+            joined.append([first_us, last_us])
+    return joined
 
 
 def _pose_rows(connection: Connection, uid: str) -> Sequence[RowMapping]:

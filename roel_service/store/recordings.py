@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from roel_service.store.files import make_folder, sync_folder
@@ -43,8 +43,10 @@ class Recordings:
         """Forget an append file; one that is not there is fine."""
         self.path(uid).unlink(missing_ok=True)
 
-    def sweep(self, keep: set[str]) -> None:
-        """Delete the files of all but some streams."""
+    def sweep(self, committed_bytes: Mapping[str, int]) -> None:
+        """Cut the files of some streams to what was committed, and delete all others."""
         for path in self._folder.iterdir():
-            if path.stem not in keep:
+            if path.stem not in committed_bytes:
                 path.unlink()
+            elif path.stat().st_size > committed_bytes[path.stem]:
+                self.cut(path.stem, committed_bytes[path.stem])

@@ -76,6 +76,8 @@ class EventStreamRecord:
         uid: chosen by the server, never used again; names the append file.
         start_us, end_us: first and last event on the clock of the poses; 0 without events.
         digest: hexadecimal SHA-256 of all chunks in order; empty until finalized.
+        fence: number of the writer that may append; grows with every takeover.
+        longest_gap_us: longest time between two neighbouring events.
     """
 
     id: str
@@ -89,6 +91,8 @@ class EventStreamRecord:
     end_us: int
     pose_count: int
     digest: str
+    fence: int
+    longest_gap_us: int
     create_time_us: int
 
 

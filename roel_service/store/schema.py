@@ -32,6 +32,8 @@ EVENT_STREAM = Table(
     Column("end_us", BigInteger, nullable=False),
     Column("pose_count", BigInteger, nullable=False),
     Column("digest", String, nullable=False),
+    Column("fence", BigInteger, nullable=False),
+    Column("longest_gap_us", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
 )
 
@@ -46,6 +48,7 @@ EVENT_CHUNK = Table(
     Column("offset", BigInteger, nullable=False),
     Column("length", Integer, nullable=False),
     Column("sha256", String, nullable=False),
+    Index("event_chunk_time", "stream_uid", "t0_us"),
 )
 
 POSE_PART = Table(
@@ -56,6 +59,7 @@ POSE_PART = Table(
     Column("pose_count", Integer, nullable=False),
     Column("t0_us", BigInteger, nullable=False),
     Column("t1_us", BigInteger, nullable=False),
+    Column("covered_us", String, nullable=False),
     Column("sha256", String, nullable=False),
 )
 

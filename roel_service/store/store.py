@@ -62,7 +62,7 @@ class Store:
         """Delete files that no row names: a crash left them, and nothing is being written yet."""
         with self._database.read() as connection:
             self._blobs.sweep(referenced(connection))
-        self._recordings.sweep(self.event_streams.open_uids())
+        self.event_streams.recover()
 
 
 def _check_folder(folder: Path) -> None:

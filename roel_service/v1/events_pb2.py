@@ -28,7 +28,7 @@ from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__
 from roel_service.v1 import types_pb2 as roel__service_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1croel_service/v1/events.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1broel_service/v1/types.proto\"\xb3\x03\n\x0b\x45ventStream\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x03\x12\x37\n\x05state\x18\x02 \x01(\x0e\x32\".roel_service.v1.EventStream.StateB\x04\xe2\x41\x01\x03\x12-\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x19\n\x0b\x63hunk_count\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x19\n\x0b\x65vent_count\x18\x05 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\nsize_bytes\x18\x06 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x16\n\x08start_us\x18\x07 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x65nd_us\x18\x08 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\npose_count\x18\t \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x64igest\x18\n \x01(\tB\x04\xe2\x41\x01\x03\x12\x35\n\x0b\x63reate_time\x18\x0b \x01(\x0b\x32\x1a.google.protobuf.TimestampB\x04\xe2\x41\x01\x03\"C\n\x05State\x12\x15\n\x11STATE_UNSPECIFIED\x10\x00\x12\x0e\n\nSTATE_OPEN\x10\x01\x12\x13\n\x0fSTATE_FINALIZED\x10\x02\"\x89\x01\n\x18\x43reateEventStreamRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1d\n\x0f\x65vent_stream_id\x18\x02 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x0c\x65vent_stream\x18\x03 \x01(\x0b\x32\x1c.roel_service.v1.EventStreamB\x04\xe2\x41\x01\x02\"3\n\nEventChunk\x12\x11\n\x03seq\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x12\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\"c\n\x13\x41ppendEventsRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"b\n\x12\x41ppendPosesRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05poses\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.TrajectoryH\x00\x42\x06\n\x04part\"0\n\x1a\x46inalizeEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"+\n\x15GetEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x17ListEventStreamsRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x17\n\tpage_size\x18\x02 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x18\n\npage_token\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"h\n\x18ListEventStreamsResponse\x12\x33\n\revent_streams\x18\x01 \x03(\x0b\x32\x1c.roel_service.v1.EventStream\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\".\n\x18\x44\x65leteEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x32\x97\x05\n\x12\x45ventStreamService\x12\\\n\x11\x43reateEventStream\x12).roel_service.v1.CreateEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12T\n\x0c\x41ppendEvents\x12$.roel_service.v1.AppendEventsRequest\x1a\x1c.roel_service.v1.EventStream(\x01\x12R\n\x0b\x41ppendPoses\x12#.roel_service.v1.AppendPosesRequest\x1a\x1c.roel_service.v1.EventStream(\x01\x12`\n\x13\x46inalizeEventStream\x12+.roel_service.v1.FinalizeEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12V\n\x0eGetEventStream\x12&.roel_service.v1.GetEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12g\n\x10ListEventStreams\x12(.roel_service.v1.ListEventStreamsRequest\x1a).roel_service.v1.ListEventStreamsResponse\x12V\n\x11\x44\x65leteEventStream\x12).roel_service.v1.DeleteEventStreamRequest\x1a\x16.google.protobuf.Emptyb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1croel_service/v1/events.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1broel_service/v1/types.proto\"\xb3\x03\n\x0b\x45ventStream\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x03\x12\x37\n\x05state\x18\x02 \x01(\x0e\x32\".roel_service.v1.EventStream.StateB\x04\xe2\x41\x01\x03\x12-\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x19\n\x0b\x63hunk_count\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x19\n\x0b\x65vent_count\x18\x05 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\nsize_bytes\x18\x06 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x16\n\x08start_us\x18\x07 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x65nd_us\x18\x08 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\npose_count\x18\t \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x64igest\x18\n \x01(\tB\x04\xe2\x41\x01\x03\x12\x35\n\x0b\x63reate_time\x18\x0b \x01(\x0b\x32\x1a.google.protobuf.TimestampB\x04\xe2\x41\x01\x03\"C\n\x05State\x12\x15\n\x11STATE_UNSPECIFIED\x10\x00\x12\x0e\n\nSTATE_OPEN\x10\x01\x12\x13\n\x0fSTATE_FINALIZED\x10\x02\"\x89\x01\n\x18\x43reateEventStreamRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1d\n\x0f\x65vent_stream_id\x18\x02 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x0c\x65vent_stream\x18\x03 \x01(\x0b\x32\x1c.roel_service.v1.EventStreamB\x04\xe2\x41\x01\x02\"3\n\nEventChunk\x12\x11\n\x03seq\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x12\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\"c\n\x13\x41ppendEventsRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"m\n\x0c\x41ppendStatus\x12\x15\n\rcommitted_seq\x18\x01 \x01(\x03\x12\x15\n\rcredit_chunks\x18\x02 \x01(\x05\x12/\n\x07quality\x18\x03 \x01(\x0b\x32\x1e.roel_service.v1.AppendQuality\"U\n\rAppendQuality\x12\x15\n\revent_rate_hz\x18\x01 \x01(\x01\x12\x15\n\rpose_coverage\x18\x02 \x01(\x01\x12\x16\n\x0elongest_gap_us\x18\x03 \x01(\x03\".\n\x18QueryAppendStatusRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x12\x41ppendPosesRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05poses\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.TrajectoryH\x00\x42\x06\n\x04part\"0\n\x1a\x46inalizeEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"+\n\x15GetEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x17ListEventStreamsRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x17\n\tpage_size\x18\x02 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x18\n\npage_token\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"h\n\x18ListEventStreamsResponse\x12\x33\n\revent_streams\x18\x01 \x03(\x0b\x32\x1c.roel_service.v1.EventStream\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\".\n\x18\x44\x65leteEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x32\xf9\x05\n\x12\x45ventStreamService\x12\\\n\x11\x43reateEventStream\x12).roel_service.v1.CreateEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12W\n\x0c\x41ppendEvents\x12$.roel_service.v1.AppendEventsRequest\x1a\x1d.roel_service.v1.AppendStatus(\x01\x30\x01\x12]\n\x11QueryAppendStatus\x12).roel_service.v1.QueryAppendStatusRequest\x1a\x1d.roel_service.v1.AppendStatus\x12R\n\x0b\x41ppendPoses\x12#.roel_service.v1.AppendPosesRequest\x1a\x1c.roel_service.v1.EventStream(\x01\x12`\n\x13\x46inalizeEventStream\x12+.roel_service.v1.FinalizeEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12V\n\x0eGetEventStream\x12&.roel_service.v1.GetEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12g\n\x10ListEventStreams\x12(.roel_service.v1.ListEventStreamsRequest\x1a).roel_service.v1.ListEventStreamsResponse\x12V\n\x11\x44\x65leteEventStream\x12).roel_service.v1.DeleteEventStreamRequest\x1a\x16.google.protobuf.Emptyb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -67,6 +67,8 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_EVENTCHUNK'].fields_by_name['seq']._serialized_options = b'\342A\001\002'
   _globals['_EVENTCHUNK'].fields_by_name['data']._loaded_options = None
   _globals['_EVENTCHUNK'].fields_by_name['data']._serialized_options = b'\342A\001\002'
+  _globals['_QUERYAPPENDSTATUSREQUEST'].fields_by_name['name']._loaded_options = None
+  _globals['_QUERYAPPENDSTATUSREQUEST'].fields_by_name['name']._serialized_options = b'\342A\001\002'
   _globals['_FINALIZEEVENTSTREAMREQUEST'].fields_by_name['name']._loaded_options = None
   _globals['_FINALIZEEVENTSTREAMREQUEST'].fields_by_name['name']._serialized_options = b'\342A\001\002'
   _globals['_GETEVENTSTREAMREQUEST'].fields_by_name['name']._loaded_options = None
@@ -89,18 +91,24 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_EVENTCHUNK']._serialized_end=802
   _globals['_APPENDEVENTSREQUEST']._serialized_start=804
   _globals['_APPENDEVENTSREQUEST']._serialized_end=903
-  _globals['_APPENDPOSESREQUEST']._serialized_start=905
-  _globals['_APPENDPOSESREQUEST']._serialized_end=1003
-  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_start=1005
-  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_end=1053
-  _globals['_GETEVENTSTREAMREQUEST']._serialized_start=1055
-  _globals['_GETEVENTSTREAMREQUEST']._serialized_end=1098
-  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_start=1100
-  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_end=1198
-  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_start=1200
-  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_end=1304
-  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_start=1306
-  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_end=1352
-  _globals['_EVENTSTREAMSERVICE']._serialized_start=1355
-  _globals['_EVENTSTREAMSERVICE']._serialized_end=2018
+  _globals['_APPENDSTATUS']._serialized_start=905
+  _globals['_APPENDSTATUS']._serialized_end=1014
+  _globals['_APPENDQUALITY']._serialized_start=1016
+  _globals['_APPENDQUALITY']._serialized_end=1101
+  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_start=1103
+  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_end=1149
+  _globals['_APPENDPOSESREQUEST']._serialized_start=1151
+  _globals['_APPENDPOSESREQUEST']._serialized_end=1249
+  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_start=1251
+  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_end=1299
+  _globals['_GETEVENTSTREAMREQUEST']._serialized_start=1301
+  _globals['_GETEVENTSTREAMREQUEST']._serialized_end=1344
+  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_start=1346
+  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_end=1444
+  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_start=1446
+  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_end=1550
+  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_start=1552
+  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_end=1598
+  _globals['_EVENTSTREAMSERVICE']._serialized_start=1601
+  _globals['_EVENTSTREAMSERVICE']._serialized_end=2362
 # @@protoc_insertion_point(module_scope)

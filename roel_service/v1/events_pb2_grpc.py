@@ -41,10 +41,15 @@ class EventStreamServiceStub:
                 request_serializer=roel__service_dot_v1_dot_events__pb2.CreateEventStreamRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_events__pb2.EventStream.FromString,
                 _registered_method=True)
-        self.AppendEvents = channel.stream_unary(
+        self.AppendEvents = channel.stream_stream(
                 '/roel_service.v1.EventStreamService/AppendEvents',
                 request_serializer=roel__service_dot_v1_dot_events__pb2.AppendEventsRequest.SerializeToString,
-                response_deserializer=roel__service_dot_v1_dot_events__pb2.EventStream.FromString,
+                response_deserializer=roel__service_dot_v1_dot_events__pb2.AppendStatus.FromString,
+                _registered_method=True)
+        self.QueryAppendStatus = channel.unary_unary(
+                '/roel_service.v1.EventStreamService/QueryAppendStatus',
+                request_serializer=roel__service_dot_v1_dot_events__pb2.QueryAppendStatusRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_events__pb2.AppendStatus.FromString,
                 _registered_method=True)
         self.AppendPoses = channel.stream_unary(
                 '/roel_service.v1.EventStreamService/AppendPoses',
@@ -85,8 +90,18 @@ class EventStreamServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def AppendEvents(self, request_iterator, context):
-        """Appends events. What `chunk_count` of the answer, or of GetEventStream after a broken call,
-        counts is durable; a client continues with that sequence number.
+        """Appends events. The first answer tells what is durable already, and the client begins with
+        that chunk; each further answer acknowledges chunks that became durable. Credit is the only
+        backpressure: a chunk beyond it ends the call with CREDIT_EXCEEDED. A call on a recording that
+        another call writes takes over, and the other ends with WRITER_REPLACED. After a broken call,
+        or a minute of silence, the client calls again and continues where the first answer says.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def QueryAppendStatus(self, request, context):
+        """What AppendEvents would answer first; no writer is replaced.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -135,10 +150,15 @@ def add_EventStreamServiceServicer_to_server(servicer, server):
                     request_deserializer=roel__service_dot_v1_dot_events__pb2.CreateEventStreamRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_events__pb2.EventStream.SerializeToString,
             ),
-            'AppendEvents': grpc.stream_unary_rpc_method_handler(
+            'AppendEvents': grpc.stream_stream_rpc_method_handler(
                     servicer.AppendEvents,
                     request_deserializer=roel__service_dot_v1_dot_events__pb2.AppendEventsRequest.FromString,
-                    response_serializer=roel__service_dot_v1_dot_events__pb2.EventStream.SerializeToString,
+                    response_serializer=roel__service_dot_v1_dot_events__pb2.AppendStatus.SerializeToString,
+            ),
+            'QueryAppendStatus': grpc.unary_unary_rpc_method_handler(
+                    servicer.QueryAppendStatus,
+                    request_deserializer=roel__service_dot_v1_dot_events__pb2.QueryAppendStatusRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_events__pb2.AppendStatus.SerializeToString,
             ),
             'AppendPoses': grpc.stream_unary_rpc_method_handler(
                     servicer.AppendPoses,
@@ -215,12 +235,39 @@ class EventStreamService:
             wait_for_ready=None,
             timeout=None,
             metadata=None):
-        return grpc.experimental.stream_unary(
+        return grpc.experimental.stream_stream(
             request_iterator,
             target,
             '/roel_service.v1.EventStreamService/AppendEvents',
             roel__service_dot_v1_dot_events__pb2.AppendEventsRequest.SerializeToString,
-            roel__service_dot_v1_dot_events__pb2.EventStream.FromString,
+            roel__service_dot_v1_dot_events__pb2.AppendStatus.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def QueryAppendStatus(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.EventStreamService/QueryAppendStatus',
+            roel__service_dot_v1_dot_events__pb2.QueryAppendStatusRequest.SerializeToString,
+            roel__service_dot_v1_dot_events__pb2.AppendStatus.FromString,
             options,
             channel_credentials,
             insecure,

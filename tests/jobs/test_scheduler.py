@@ -9,25 +9,18 @@ from roel_service.errors import LimitError, NotFoundError, UnavailableError
 from roel_service.jobs import scheduler as scheduling
 from roel_service.jobs.executors import InlineExecutor
 from roel_service.jobs.scheduler import Policy, Scheduler
-from roel_service.scene.camera import Camera
-from roel_service.store.event_streams import Chunk, PosePart
 from roel_service.store.records import OperationMethod, OperationState, VersionState
 from roel_service.store.store import Store
 from roel_service.v1 import operations_pb2
 from roel_service.wire.errors import error_from_status
 
-CAMERA = Camera(width=8, height=6, fx_px=5.0, fy_px=5.0, cx_px=4.0, cy_px=3.0)
+from ..store.samples import finalized
 
 
 @pytest.fixture
 def store(tmp_path):
     with Store(tmp_path / "data") as opened:
-        opened.event_streams.create("walk", CAMERA)
-        chunk = Chunk(seq=0, t0_us=0, t1_us=1, event_count=1, data=b"events")
-        opened.event_streams.append_chunks("walk", [chunk], 100)
-        poses = PosePart(t0_us=0, t1_us=1, pose_count=2, data=b"poses")
-        opened.event_streams.append_poses("walk", poses, 100)
-        opened.event_streams.finalize("walk")
+        finalized(opened, "walk")
         opened.maps.create("house")
         yield opened
 

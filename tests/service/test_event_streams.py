@@ -1,3 +1,6 @@
+import dataclasses
+from contextlib import ExitStack
+
 import numpy as np
 import pytest
 
@@ -43,6 +46,33 @@ def call(connection, stub):
 def upload(connection, stub):
     """A streaming call of the service by its name."""
     return lambda method, *requests: connection.upload(getattr(stub, method), requests)
+
+
+@pytest.fixture
+def append(connection, stub):
+    """All answers of a call of AppendEvents."""
+    return lambda *requests: list(connection.stream(stub.AppendEvents, iter(requests)))
+
+
+def parts_of(events, count):
+    """Consecutive streams of so many events."""
+    for start in range(0, len(events), count):
+        part = slice(start, start + count)
+        columns = {name: getattr(events, name)[part] for name in ("t_us", "x", "y", "polarity")}
+        yield dataclasses.replace(events, **columns)
+
+
+@pytest.fixture
+def writing(connection, stub):
+    """Begins a call of AppendEvents on a recording, and reads its first answer."""
+    with ExitStack() as calls:
+
+        def begin(stream):
+            exchange = calls.enter_context(connection.exchange(stub.AppendEvents))
+            exchange.send(header(stream))
+            return exchange, exchange.receive()
+
+        yield begin
 
 
 def header(stream):
@@ -172,43 +202,43 @@ def changed(data, place):
         (lambda data: b"not a chunk" * 10, "CHUNK_MALFORMED"),
     ],
 )
-def test_damaged_chunks_are_refused_and_leave_nothing(client, upload, stream, damage, reason):
+def test_damaged_chunks_are_refused_and_leave_nothing(client, append, stream, damage, reason):
     data = damage(encode_chunk(events_of(100)))
     with pytest.raises(EventsError) as caught:
-        upload("AppendEvents", header(stream), chunk(0, data))
+        append(header(stream), chunk(0, data))
     assert caught.value.reason == reason
     assert client.event_stream(stream).chunk_count == 0
 
 
-def test_a_chunk_that_goes_back_in_time_is_refused(upload, stream):
+def test_a_chunk_that_goes_back_in_time_is_refused(append, stream):
     data = encode_chunk(events_of(100))
     with pytest.raises(EventsError) as caught:
-        upload("AppendEvents", header(stream), chunk(0, data), chunk(1, data))
+        append(header(stream), chunk(0, data), chunk(1, data))
     assert caught.value.reason == "EVENT_TIME_NOT_MONOTONE"
 
 
-def test_gaps_and_conflicts_are_told_apart(client, upload, stream):
+def test_gaps_and_conflicts_are_told_apart(client, append, stream):
     data = encode_chunk(events_of(100))
     with pytest.raises(StateError) as gap:
-        upload("AppendEvents", header(stream), chunk(3, data))
-    assert gap.value.reason == "SEQUENCE_GAP"
-    upload("AppendEvents", header(stream), chunk(0, data))
-    assert upload("AppendEvents", header(stream), chunk(0, data)).chunk_count == 1
+        append(header(stream), chunk(3, data))
+    assert (gap.value.reason, gap.value.expected) == ("SEQUENCE_GAP", "0")
+    append(header(stream), chunk(0, data))
+    assert append(header(stream), chunk(0, data))[-1].committed_seq == 1
     with pytest.raises(ConflictError) as conflict:
-        upload("AppendEvents", header(stream), chunk(0, encode_chunk(events_of(100, seed=1))))
+        append(header(stream), chunk(0, encode_chunk(events_of(100, seed=1))))
     assert conflict.value.reason == "CHUNK_CONFLICT"
 
 
-def test_an_upload_begins_with_the_name_of_its_recording(upload, stream):
+def test_an_upload_begins_with_the_name_of_its_recording(upload, stream, append):
     data = encode_chunk(events_of(100))
     for requests in ([], [chunk(0, data)], [header(stream), header(stream)]):
         with pytest.raises(InputError):
-            upload("AppendEvents", *requests)
+            append(*requests)
     with pytest.raises(InputError) as caught:
         upload("AppendPoses", poses(trajectory_of(3)))
     assert caught.value.reason == "UPLOAD_ORDER"
     with pytest.raises(NotFoundError):
-        upload("AppendEvents", header("projects/default/eventStreams/nowhere"), chunk(0, data))
+        append(header("projects/default/eventStreams/nowhere"), chunk(0, data))
 
 
 def test_a_recording_has_a_largest_size(client, stream):
@@ -217,9 +247,9 @@ def test_a_recording_has_a_largest_size(client, stream):
     assert caught.value.reason == "EVENT_STREAM_TOO_LARGE"
 
 
-def test_a_message_has_a_largest_size(upload, stream):
+def test_a_message_has_a_largest_size(append, stream):
     with pytest.raises(LimitError):
-        upload("AppendEvents", header(stream), chunk(0, b"x" * (5 << 20)))
+        append(header(stream), chunk(0, b"x" * (5 << 20)))
 
 
 def test_poses_are_checked(client, upload, stream):
@@ -243,10 +273,10 @@ def test_there_are_only_so_many_poses(client, stream, count):
     assert caught.value.reason == "TOO_MANY_POSES"
 
 
-def test_a_finalized_recording_takes_nothing_more(client, upload):
+def test_a_finalized_recording_takes_nothing_more(client, append):
     stream = ready_recording(client)
     with pytest.raises(StateError) as events:
-        upload("AppendEvents", header(stream), chunk(1, encode_chunk(events_of(3))))
+        append(header(stream), chunk(1, encode_chunk(events_of(3))))
     with pytest.raises(StateError) as late_poses:
         client.upload_poses(stream, trajectory_of(3))
     assert events.value.reason == late_poses.value.reason == "STREAM_FINALIZED"
@@ -256,3 +286,53 @@ def test_a_recording_needs_events(client, stream):
     with pytest.raises(EventsError) as caught:
         client.finalize(stream)
     assert caught.value.reason == "NO_EVENTS"
+
+
+def test_the_first_answer_tells_what_is_durable(client, stream, writing):
+    _, status = writing(stream)
+    assert (status.committed_seq, status.credit_chunks) == (0, 16)
+    client.upload_events(stream, events_of(200_000))
+    _, status = writing(stream)
+    assert status.committed_seq == 2
+
+
+def test_asking_for_the_status_replaces_no_writer(call, stream, writing):
+    writer, first = writing(stream)
+    request = events_pb2.QueryAppendStatusRequest(name=stream)
+    assert call("QueryAppendStatus", request) == first
+    writer.send(chunk(0, encode_chunk(events_of(10))))
+    status = writer.receive()
+    assert status.committed_seq == 1
+    assert call("QueryAppendStatus", request) == status
+
+
+def test_a_chunk_is_acknowledged_without_another_one(stream, writing):
+    """A slow source is not made to wait for its group to fill."""
+    writer, _ = writing(stream)
+    for seq, events in enumerate(parts_of(events_of(40), 10)):
+        writer.send(chunk(seq, encode_chunk(events)))
+        assert writer.receive().committed_seq == seq + 1
+
+
+def test_a_second_writer_takes_over(stream, writing):
+    chunks = [encode_chunk(events) for events in parts_of(events_of(30), 10)]
+    first, _ = writing(stream)
+    first.send(chunk(0, chunks[0]))
+    first.receive()
+    second, status = writing(stream)
+    assert status.committed_seq == 1
+    with pytest.raises(ConflictError) as caught:
+        first.receive()
+    assert caught.value.reason == "WRITER_REPLACED"
+    second.send(chunk(1, chunks[1]))
+    assert second.receive().committed_seq == 2
+
+
+def test_answers_tell_how_good_the_recording_is(client, call, stream, append):
+    client.upload_poses(stream, trajectory_of(81))  # covers 400 ms
+    t_us = np.array([0, 100_000, 350_000, 800_000])
+    events = dataclasses.replace(events_of(4), t_us=t_us)
+    quality = append(header(stream), chunk(0, encode_chunk(events)))[-1].quality
+    assert quality.event_rate_hz == pytest.approx(4 / 0.8)
+    assert quality.pose_coverage == pytest.approx(0.5)
+    assert quality.longest_gap_us == 450_000

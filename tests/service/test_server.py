@@ -133,34 +133,24 @@ def test_another_host_is_served_when_that_is_wanted(folder):
         assert process.wait(30) == 0
 
 
-def test_committed_chunks_survive_a_killed_server(start_server):
+def test_acknowledged_chunks_survive_a_killed_server(start_server):
     first = start_server(commit_bytes=1)
-    killed = threading.Event()
-
-    def requests(stream):
-        """Stops half way until the server is gone."""
-        yield events_pb2.AppendEventsRequest(event_stream=stream)
-        for seq, events in enumerate(split_chunks(events_of(300_000))):
-            if seq == 2:
-                killed.wait()
-            chunk = events_pb2.EventChunk(seq=seq, data=encode_chunk(events))
-            yield events_pb2.AppendEventsRequest(chunk=chunk)
-
-    def upload(stream):
-        connection = Connection(Endpoint(address=first.address))
-        stub = events_pb2_grpc.EventStreamServiceStub(connection.channel)
-        with pytest.raises(UnavailableError):
-            connection.upload(stub.AppendEvents, requests(stream))
-        connection.close()
-
+    chunks = [encode_chunk(events) for events in split_chunks(events_of(300_000))]
     with Client(first.address) as client:
         stream = client.create_event_stream("walk", CAMERA)
-        uploading = threading.Thread(target=upload, args=(stream,))
-        uploading.start()
-        wait_until(lambda: client.event_stream(stream).chunk_count == 2)
+    connection = Connection(Endpoint(address=first.address))
+    stub = events_pb2_grpc.EventStreamServiceStub(connection.channel)
+    with connection.exchange(stub.AppendEvents) as exchange:
+        exchange.send(events_pb2.AppendEventsRequest(event_stream=stream))
+        for seq in range(2):
+            chunk = events_pb2.EventChunk(seq=seq, data=chunks[seq])
+            exchange.send(events_pb2.AppendEventsRequest(chunk=chunk))
+        while exchange.receive().committed_seq < 2:
+            pass
         first.kill()
-        killed.set()
-        uploading.join()
+        with pytest.raises(UnavailableError):
+            exchange.receive()
+    connection.close()
     second = start_server()
     with Client(second.address) as client:
         record = client.event_stream(stream)

@@ -4,7 +4,7 @@ from roel_service.errors import NotFoundError, StateError
 from roel_service.store.builds import BuiltVersion
 from roel_service.store.records import OperationState, VersionState
 
-from .samples import CAMERA, LIMIT_BYTES, chunk, finalized, leased
+from .samples import CAMERA, append, chunk, finalized, leased
 
 BUILT = BuiltVersion(
     rlm_bytes=b"map", line_count=3, bounds_m=[0.0] * 6, report={"seconds": {"trim": 0.5}}
@@ -59,7 +59,7 @@ def test_a_build_needs_a_map_and_a_finalized_recording_with_poses(store, builds)
     store.event_streams.create("open", CAMERA)
     with pytest.raises(StateError) as not_finalized:
         builds.begin("house", "open")
-    store.event_streams.append_chunks("open", [chunk(0)], LIMIT_BYTES)
+    append(store.event_streams, "open", chunk(0))
     store.event_streams.finalize("open")
     with pytest.raises(StateError) as no_poses:
         builds.begin("house", "open")

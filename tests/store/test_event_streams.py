@@ -16,6 +16,7 @@ from roel_service.scene.camera import Camera, CameraModel
 from roel_service.store.records import StreamState
 from roel_service.store.store import Store
 
+from . import samples
 from .samples import CAMERA, LIMIT_BYTES, chunk, finalized, pose_part
 
 
@@ -26,7 +27,7 @@ def streams(store):
 
 
 def append(streams, *chunks, limit_bytes=LIMIT_BYTES):
-    return streams.append_chunks("walk", chunks, limit_bytes)
+    return samples.append(streams, "walk", *chunks, limit_bytes=limit_bytes)
 
 
 def test_a_new_recording_is_open_and_empty(streams):
@@ -73,7 +74,7 @@ def test_a_recording_may_begin_before_zero(streams):
 
 def test_equal_chunks_sent_again_change_nothing(streams):
     record = append(streams, chunk(0), chunk(1))
-    assert append(streams, chunk(0)) == record
+    assert streams.append_chunks("walk", record.fence, [chunk(0)], LIMIT_BYTES) == record
     assert append(streams, chunk(0), chunk(1), chunk(2)).chunk_count == 3
 
 
@@ -86,7 +87,7 @@ def test_another_chunk_under_a_used_number_is_a_conflict(streams):
 
 def test_a_gap_names_the_number_that_is_expected(streams):
     append(streams, chunk(0))
-    with pytest.raises(StateError, match="expected seq 1, found seq 2") as caught:
+    with pytest.raises(StateError, match="seq: expected 1, found 2") as caught:
         append(streams, chunk(2))
     assert caught.value.reason == "SEQUENCE_GAP"
 
@@ -102,6 +103,36 @@ def test_a_recording_beyond_the_limit_is_refused(streams):
     append(streams, chunk(0, b"12345678"), limit_bytes=10)
     with pytest.raises(LimitError, match="at most 10 bytes of events, found 11"):
         append(streams, chunk(1, b"123"), limit_bytes=10)
+
+
+def test_the_writer_that_was_replaced_appends_no_more(streams):
+    first = streams.take_over("walk").fence
+    streams.append_chunks("walk", first, [chunk(0)], LIMIT_BYTES)
+    second = streams.take_over("walk").fence
+    with pytest.raises(ConflictError) as caught:
+        streams.append_chunks("walk", first, [chunk(1, b"late")], LIMIT_BYTES)
+    assert caught.value.reason == "WRITER_REPLACED"
+    assert streams.append_chunks("walk", second, [chunk(1)], LIMIT_BYTES).chunk_count == 2
+
+
+def test_the_longest_gap_is_inside_a_chunk_or_between_two(streams):
+    record = append(streams, chunk(0, longest_step_us=40), chunk(1, longest_step_us=70))
+    assert record.longest_gap_us == 100
+    record = append(streams, chunk(2, longest_step_us=650), chunk(3))
+    assert record.longest_gap_us == 650
+    assert append(streams, chunk(4, t0_us=9000)).longest_gap_us == 9000 - 3900
+
+
+def test_spans_of_poses_join_where_no_gap_divides_them(streams):
+    parts = [
+        pose_part(0, 2_000_000, covered_us=[[0, 400_000], [1_000_000, 2_000_000]]),
+        pose_part(2_500_000, 3_000_000),
+        pose_part(3_500_001, 4_000_000),
+    ]
+    for part in parts:
+        record = streams.append_poses("walk", part, 100)
+    covered_us = [[0, 400_000], [1_000_000, 3_000_000], [3_500_001, 4_000_000]]
+    assert streams.covered_us(record) == covered_us
 
 
 def test_poses_must_follow_the_stored_ones(streams):
@@ -188,11 +219,12 @@ def test_pages_follow_the_order_of_ids(store):
 def test_bytes_that_were_never_committed_are_cut_away(folder):
     with Store(folder) as store:
         uid = store.event_streams.create("walk", CAMERA).uid
-        store.event_streams.append_chunks("walk", [chunk(0, b"one")], LIMIT_BYTES)
+        append(store.event_streams, chunk(0, b"one"))
     with (folder / "recordings" / f"{uid}.rec").open("ab") as file:
         file.write(b"torn")
     with Store(folder) as store:
-        store.event_streams.append_chunks("walk", [chunk(1, b"two")], LIMIT_BYTES)
+        assert (folder / "recordings" / f"{uid}.rec").read_bytes() == b"one"
+        append(store.event_streams, chunk(1, b"two"))
         record = store.event_streams.finalize("walk")
         assert store.event_streams.event_file(record).read_bytes() == b"onetwo"
 
@@ -213,7 +245,7 @@ def test_any_way_of_sending_gives_the_same_recording(tmp_path_factory, data):
                 break
             first = data.draw(st.integers(0, held))
             last = data.draw(st.integers(held + 1, len(chunks)))
-            store.event_streams.append_chunks("walk", chunks[first:last], LIMIT_BYTES)
+            append(store.event_streams, *chunks[first:last])
     with Store(folder) as store:
         record = store.event_streams.finalize("walk")
         content = store.event_streams.event_file(record).read_bytes()

@@ -15,6 +15,7 @@ from roel_service.store.migrations import (
     m002_methods_of_operations,
     m003_tasks,
     m004_maps_and_requests,
+    m005_writers_of_recordings,
 )
 
 # Step k leads from version k to k + 1.
@@ -23,6 +24,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m002_methods_of_operations.migrate,
     m003_tasks.migrate,
     m004_maps_and_requests.migrate,
+    m005_writers_of_recordings.migrate,
 )
 
 
