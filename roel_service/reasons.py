@@ -98,6 +98,7 @@ _ROWS = (
     ),
     Reason("INSECURE_HOST", InputError, "serving another host than loopback without `--insecure`"),
     Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
+    Reason("DATA_UNSOUND", NoAnswerError, "a data folder in which a check found problems"),
     Reason("TOO_FEW_LINES", NoAnswerError, "a map of fewer than three lines"),
     Reason("NOT_REGISTERED", NoAnswerError, "a registration not to be relied on, with `--strict`"),
     Reason("NOT_FOUND", NotFoundError, "a resource that does not exist"),
@@ -119,6 +120,10 @@ _ROWS = (
     Reason("OPERATION_RUNNING", StateError, "deleting an operation that has not ended"),
     Reason("DATA_IN_USE", StateError, "a data folder that another server has open"),
     Reason("DATA_TOO_NEW", StateError, "a data folder that a newer release wrote"),
+    Reason(
+        "DATA_TOO_OLD", StateError, "a data folder of an older release, not started with this one"
+    ),
+    Reason("BACKUP_OUTDATED", StateError, "a data folder whose copy is not sound, time after time"),
     Reason("CONFLICT", ConflictError, "somebody else was faster, for no reason listed below"),
     Reason("ALREADY_EXISTS", ConflictError, "creating what exists"),
     Reason("ETAG_MISMATCH", ConflictError, "changing what was changed since it was read"),

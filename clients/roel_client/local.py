@@ -227,6 +227,38 @@ def serve(
     asyncio.run(server.serve(data, host, port, insecure=insecure, on_ready=on_ready))
 
 
+def check_data(folder: str) -> dict[str, Any]:
+    """What a check of a data folder found; raises `NoAnswerError` DATA_UNSOUND for problems."""
+    from roel_service.errors import NoAnswerError
+    from roel_service.store.fsck import check_folder
+
+    findings = asdict(check_folder(Path(folder)))
+    problems = findings["problems"]
+    if problems:
+        found = f"{len(problems)} problems, first: {problems[0]}"
+        reason = "DATA_UNSOUND"
+        raise NoAnswerError(folder, "a sound folder", found, reason=reason, result=findings)
+    return findings
+
+
+def back_up_data(folder: str, target: Path) -> dict[str, Any]:
+    """Copy a data folder to a new place; what the check of the copy found."""
+    from roel_service.store.backup import back_up
+
+    return asdict(back_up(Path(folder), target))
+
+
+def collect_garbage(folder: str) -> dict[str, Any]:
+    """Delete what nobody needs; how much that was. No server may have the folder."""
+    from roel_service.errors import InputError
+    from roel_service.store.store import Store
+
+    if not (Path(folder) / "rows.sqlite").is_file():
+        raise InputError(folder, "a data folder", "none")
+    with Store(Path(folder)) as store:
+        return asdict(store.collect_garbage())
+
+
 def bench_mapping(
     out: Path,
     *,

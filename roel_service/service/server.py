@@ -18,6 +18,7 @@ from roel_service.errors import InputError, UnavailableError
 from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.preparation import build_preparation
 from roel_service.jobs.scheduler import Policy, Scheduler
+from roel_service.jobs.upkeep import upkeep
 from roel_service.service.interceptors import ErrorInterceptor
 from roel_service.service.services import SERVICES, add_services
 from roel_service.service.settings import Settings
@@ -67,7 +68,8 @@ async def serve(
         address = _bind(server, host, port)
         await server.start()
         on_ready(address)
-        await stop.wait()
+        async with upkeep(store, settings.sweep_interval_s):
+            await stop.wait()
         logger.info("draining")
         await health_servicer.enter_graceful_shutdown()
         await scheduler.drain()

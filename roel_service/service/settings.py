@@ -32,6 +32,7 @@ class Settings:
         upload_silence_s: an upload that sends nothing for this long is ended.
         commit_interval_s, commit_bytes: what an upload sent is made durable when its first part is
             this old, or when it is this much.
+        sweep_interval_s: time between two collections of garbage.
         download_part_bytes: size of the messages of a download.
         lines_per_message: most lines of a message of GetLines.
         label_count: most labels of a resource.
@@ -55,6 +56,7 @@ class Settings:
     open_uploads: int = 64
     upload_silence_s: float = 60.0
     commit_interval_s: float = 0.02
+    sweep_interval_s: float = 3600.0
     commit_bytes: int = 8 * MIB
     download_part_bytes: int = MIB
     lines_per_message: int = 100_000

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import uuid
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from roel_service.errors import CorruptionError
+from roel_service.failpoints import failpoint
 from roel_service.store.files import make_folder, sync_file, sync_folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredBlob:
+    """A blob as it lies there.
+
+    Attributes:
+        used_s: when it was put last, seconds since 1970.
+    """
+
+    sha256: str
+    size_bytes: int
+    used_s: float
 
 
 class BlobStore:
@@ -18,6 +34,10 @@ class BlobStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         make_folder(folder)
+        for aside in folder.glob("[0-9a-f]" * 64 + ".part"):
+            # A crash came between the two looks of `discard`.
+            _put_back(aside, self.path(aside.stem))
+            aside.unlink()
 
     def path(self, sha256: str) -> Path:
         """Where a blob is, or would be."""
@@ -28,6 +48,7 @@ class BlobStore:
         temporary = self._folder / f"{uuid.uuid4().hex}.part"
         try:
             temporary.write_bytes(data)
+            failpoint("blob.written")
             return self.adopt(temporary)
         finally:
             temporary.unlink(missing_ok=True)
@@ -37,11 +58,14 @@ class BlobStore:
         with source.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
         target = self.path(sha256)
-        if not target.exists():
+        if not _renewed(target):
             sync_file(source)
+            failpoint("blob.synced")
             make_folder(target.parent)
             # A link appears whole or not at all, as a rename does, and survives a retry.
             os.link(source, target)
+            os.utime(target)
+            failpoint("blob.linked")
             sync_folder(target.parent)
         return sha256
 
@@ -58,15 +82,54 @@ class BlobStore:
             raise CorruptionError(f"blob {sha256}", "bytes of that digest", found)
         return data
 
-    def delete(self, sha256: str) -> None:
-        """Forget a blob; one that is not there is fine."""
-        self.path(sha256).unlink(missing_ok=True)
+    def stored(self) -> Iterator[StoredBlob]:
+        """All blobs, whoever names them."""
+        for path in self._folder.glob("??/??/*"):
+            with contextlib.suppress(FileNotFoundError):
+                status = path.stat()
+                yield StoredBlob(
+                    sha256=path.name, size_bytes=status.st_size, used_s=status.st_mtime
+                )
 
-    def sweep(self, keep: Collection[str]) -> None:
-        """Delete all but some blobs, and what interrupted writes left."""
-        for path in self._files():
-            if path.name not in keep:
-                path.unlink()
+    def found_digest(self, sha256: str) -> str | None:
+        """Digest of the bytes that are there under a name, read anew; None if there are none."""
+        try:
+            with self.path(sha256).open("rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+        except FileNotFoundError:
+            return None
 
-    def _files(self) -> Iterator[Path]:
-        return (path for path in self._folder.rglob("*") if path.is_file())
+    def discard(self, sha256: str, unused_since_s: float) -> bool:
+        """Delete a blob, unless somebody has put it again since a time; whether it is gone."""
+        path, aside = self.path(sha256), self._folder / f"{sha256}.part"
+        try:
+            path.rename(aside)
+        except FileNotFoundError:
+            return False
+        # From here on `put` writes it anew. It may have renewed it just before.
+        is_old = aside.stat().st_mtime < unused_since_s
+        if not is_old:
+            _put_back(aside, path)
+        aside.unlink()
+        return is_old
+
+    def discard_parts(self, unused_since_s: float) -> None:
+        """Delete what interrupted writes left."""
+        for path in self._folder.glob("*.part"):
+            with contextlib.suppress(FileNotFoundError):
+                if path.stat().st_mtime < unused_since_s:
+                    path.unlink()
+
+
+def _renewed(path: Path) -> bool:
+    """Whether a file is there, and then newly used: no sweep under way takes it."""
+    try:
+        os.utime(path)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _put_back(aside: Path, path: Path) -> None:
+    with contextlib.suppress(FileExistsError):
+        os.link(aside, path)

@@ -11,7 +11,8 @@ from pathlib import Path
 from sqlalchemy import Connection, create_engine, event
 from sqlalchemy.pool import ConnectionPoolEntry
 
-from roel_service.store.migrations import migrate
+from roel_service.failpoints import failpoint
+from roel_service.store.migrations import check_version, migrate
 
 PRAGMAS = (
     "PRAGMA journal_mode = WAL",
@@ -35,6 +36,11 @@ class Database:
         with self.write() as connection:
             migrate(connection)
 
+    def check_version(self) -> None:
+        """Raise `StateError` DATA_TOO_NEW or DATA_TOO_OLD unless the tables are of this release."""
+        with self.read() as connection:
+            check_version(connection)
+
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """One transaction; files that belong to it become durable while it is open."""
@@ -45,13 +51,25 @@ class Database:
             except BaseException:
                 connection.exec_driver_sql("ROLLBACK")
                 raise
+            failpoint("rows.written")
             connection.exec_driver_sql("COMMIT")
+            failpoint("rows.committed")
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """Statements that each see the newest commit."""
         with self._engine.connect() as connection:
             yield connection
+
+    @contextmanager
+    def snapshot(self) -> Iterator[Connection]:
+        """Statements that all see the same commit."""
+        with self._engine.connect() as connection:
+            connection.exec_driver_sql("BEGIN")
+            try:
+                yield connection
+            finally:
+                connection.exec_driver_sql("ROLLBACK")
 
     def close(self) -> None:
         """Give back every connection."""

@@ -21,6 +21,7 @@ from roel_service.errors import (
     StateError,
     TrajectoryError,
 )
+from roel_service.failpoints import failpoint
 from roel_service.scene.camera import Camera
 from roel_service.scene.trajectory import MAX_POSE_GAP_US
 from roel_service.store.blobs import BlobStore
@@ -36,7 +37,6 @@ from roel_service.store.records import (
     row_from_record,
     stored,
 )
-from roel_service.store.references import delete_unreferenced
 from roel_service.store.schema import EVENT_CHUNK, EVENT_STREAM, OPERATION, POSE_PART
 
 
@@ -207,6 +207,7 @@ class EventStreams:
             if record.event_count == 0:
                 raise EventsError(stream_id, "events", "none", reason="NO_EVENTS")
             digest = self._blobs.adopt(self._recordings.cut(record.uid, record.size_bytes))
+            failpoint("recording.sealed")
             with self._database.write() as connection:
                 current = _get(connection, stream_id)
                 sealed = _update(connection, current, state=StreamState.FINALIZED, digest=digest)
@@ -214,15 +215,16 @@ class EventStreams:
             return sealed
 
     def delete(self, stream_id: str) -> None:
-        """Forget a recording; raises `StateError` STREAM_IN_USE while a build reads it."""
+        """Forget a recording; raises `StateError` STREAM_IN_USE while a build reads it.
+
+        Its blobs are left to the sweep.
+        """
         with self._locks.holding(stream_id), self._database.write() as connection:
             record = _get(connection, stream_id)
             if _is_in_use(connection, stream_id):
                 raise StateError(stream_id, "no build", "one at work", reason="STREAM_IN_USE")
-            poses = {row["sha256"] for row in _pose_rows(connection, record.uid)}
             connection.execute(delete(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid))
         self._recordings.delete(record.uid)
-        delete_unreferenced(self._database, self._blobs, poses | {record.digest})
 
     def event_file(self, record: EventStreamRecord) -> Path:
         """The sealed chunks of a finalized recording."""

@@ -25,6 +25,7 @@ from typing import Any, Protocol
 from sqlalchemy import Connection, delete, exists, select, update
 
 from roel_service.errors import NotFoundError, StateError
+from roel_service.failpoints import failpoint
 from roel_service.progress import Progress
 from roel_service.store.database import Database
 from roel_service.store.records import (
@@ -84,6 +85,7 @@ class Operations:
         """A first result can be used."""
         with self._leased(lease) as (connection, record):
             self._completions[record.method].preview(connection, record, partial)
+            failpoint("task.previewed")
             return _change(connection, record, {})
 
     def requeue(
@@ -111,6 +113,7 @@ class Operations:
         with self._leased(lease) as (connection, record):
             result = self._completions[record.method].succeed(connection, record, outcome)
             end_task(connection, lease, TaskState.DONE)
+            failpoint("task.ended")
             changes = {"state": OperationState.SUCCEEDED, "fraction": 1.0, "result": result}
             return _end(connection, record, changes)
 

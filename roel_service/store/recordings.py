@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+from roel_service.failpoints import failpoint
 from roel_service.store.files import make_folder, sync_folder
 
 
@@ -24,6 +25,7 @@ class Recordings:
         """Make an empty append file."""
         self.path(uid).touch()
         sync_folder(self._folder)
+        failpoint("recording.created")
 
     def append(self, uid: str, committed_bytes: int, chunks: Iterable[bytes]) -> None:
         """Write chunks durably behind the committed bytes; what lay there was never committed."""
@@ -32,7 +34,9 @@ class Recordings:
             file.seek(committed_bytes)
             file.writelines(chunks)
             file.flush()
+            failpoint("recording.written")
             os.fsync(file.fileno())
+            failpoint("recording.synced")
 
     def cut(self, uid: str, committed_bytes: int) -> Path:
         """Drop what was never committed; the file that holds the rest."""

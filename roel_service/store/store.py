@@ -14,11 +14,12 @@ from roel_service.store.builds import Builds, VersionCompletion
 from roel_service.store.database import Database
 from roel_service.store.event_streams import EventStreams
 from roel_service.store.files import make_folder
+from roel_service.store.garbage import LONGEST_UPLOAD_S, Swept, sweep_blobs
 from roel_service.store.maps import Maps
 from roel_service.store.operations import Operations
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
-from roel_service.store.references import referenced
+from roel_service.store.requests import delete_expired_requests
 from roel_service.store.tasks import Tasks
 
 
@@ -49,7 +50,8 @@ class Store:
                 self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
             )
             self.tasks = Tasks(self._database)
-            self._sweep()
+            # What a crash left of uploads; nothing is being written yet.
+            self.event_streams.recover()
             self._resources = resources.pop_all()
 
     def __enter__(self) -> Store:
@@ -58,11 +60,13 @@ class Store:
     def __exit__(self, *error: object) -> None:
         self._resources.close()
 
-    def _sweep(self) -> None:
-        """Delete files that no row names: a crash left them, and nothing is being written yet."""
-        with self._database.read() as connection:
-            self._blobs.sweep(referenced(connection))
-        self.event_streams.recover()
+    def collect_garbage(self, unused_for_s: float = LONGEST_UPLOAD_S) -> Swept:
+        """Forget what has expired, then delete the blobs that no row names."""
+        self.operations.delete_expired()
+        self.maps.forget_deleted()
+        with self._database.write() as connection:
+            delete_expired_requests(connection)
+        return sweep_blobs(self._database, self._blobs, unused_for_s)
 
 
 def _check_folder(folder: Path) -> None:

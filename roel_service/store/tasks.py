@@ -12,6 +12,7 @@ from typing import Any
 from sqlalchemy import Connection, insert, or_, select, update
 
 from roel_service.errors import ConflictError
+from roel_service.failpoints import failpoint
 from roel_service.store.database import Database
 from roel_service.store.records import (
     Lease,
@@ -56,7 +57,8 @@ class Tasks:
                 "fence": row["fence"] + 1,
             }
             _change(connection, row["id"], changes)
-            return task_from_row({**row, **stored(changes)})  # type: ignore[arg-type]
+        failpoint("task.leased")
+        return task_from_row({**row, **stored(changes)})  # type: ignore[arg-type]
 
     def renew(self, owner: str) -> set[str]:
         """Hold on to all tasks of an owner; their ids."""

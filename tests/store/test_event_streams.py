@@ -187,6 +187,7 @@ def test_a_deleted_recording_is_gone_with_its_files(store, folder):
         store.event_streams.delete(stream_id)
         with pytest.raises(NotFoundError):
             store.event_streams.get(stream_id)
+    store.collect_garbage(unused_for_s=-1.0)
     stored = [*(folder / "blobs").rglob("*"), *(folder / "recordings").iterdir()]
     assert not [path for path in stored if path.is_file()]
 

@@ -74,7 +74,7 @@ def test_a_version_at_work_has_no_file(store, maps):
     assert caught.value.reason == "MAP_NOT_ACTIVE"
 
 
-def test_a_purged_map_takes_its_versions_and_operations_along(store, maps):
+def test_a_purged_map_takes_its_versions_operations_and_files_along(store, maps, folder):
     record = built(store, b"only here")
     maps.purge("house", "", None)
     with pytest.raises(NotFoundError):
@@ -83,6 +83,8 @@ def test_a_purged_map_takes_its_versions_and_operations_along(store, maps):
         maps.version("house", 1)
     with pytest.raises(NotFoundError):
         store.operations.get(record.operation_id)
+    store.collect_garbage(unused_for_s=-1.0)
+    assert not list((folder / "blobs").rglob(record.sha256))
 
 
 def test_a_map_at_work_cannot_be_deleted(store, maps):

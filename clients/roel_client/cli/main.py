@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Callable, Sequence
 
 from roel_client.cli import (
+    admin,
     bench,
     configuration,
     demo,
@@ -135,7 +136,18 @@ def parser() -> Parser:
     top = Parser(prog="roel", description="3D line maps from event cameras.")
     top.add_argument("--version", action="version", version=f"roel {__version__}")
     subparsers = top.add_subparsers(required=True, metavar="COMMAND")
-    for group in (maps, register, evaluate, simulate, bench, configuration, serve, health, demo):
+    for group in (
+        maps,
+        register,
+        evaluate,
+        simulate,
+        bench,
+        configuration,
+        serve,
+        health,
+        admin,
+        demo,
+    ):
         group.add_commands(subparsers)
     return top
 

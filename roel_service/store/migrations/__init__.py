@@ -32,12 +32,25 @@ def migrate(connection: Connection) -> None:
     """Bring the tables to the newest version.
 
     Raises:
-        StateError: the folder was written by a newer release.
+        StateError: DATA_TOO_NEW, the folder was written by a newer release.
     """
-    version = connection.execute(text("PRAGMA user_version")).scalar_one()
-    if version > len(MIGRATIONS):
-        expected = f"a data folder of version {len(MIGRATIONS)} or older"
-        raise StateError("data folder", expected, f"version {version}", reason="DATA_TOO_NEW")
+    version = _version(connection)
     for step in MIGRATIONS[version:]:
         step(connection)
     connection.execute(text(f"PRAGMA user_version = {len(MIGRATIONS)}"))
+
+
+def check_version(connection: Connection) -> None:
+    """Raise `StateError` DATA_TOO_NEW or DATA_TOO_OLD unless the tables are the newest."""
+    version = _version(connection)
+    if version < len(MIGRATIONS):
+        expected = f"a data folder of version {len(MIGRATIONS)}, which its next start makes it"
+        raise StateError("data folder", expected, f"version {version}", reason="DATA_TOO_OLD")
+
+
+def _version(connection: Connection) -> int:
+    version = int(connection.execute(text("PRAGMA user_version")).scalar_one())
+    if version > len(MIGRATIONS):
+        expected = f"a data folder of version {len(MIGRATIONS)} or older"
+        raise StateError("data folder", expected, f"version {version}", reason="DATA_TOO_NEW")
+    return version
