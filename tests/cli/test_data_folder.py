@@ -2,7 +2,9 @@ import json
 
 import pytest
 
+from roel_client import local
 from roel_client.cli.main import main
+from roel_service.errors import NoAnswerError
 from roel_service.store.store import Store
 
 
@@ -28,6 +30,9 @@ def test_problems_are_an_answer_of_their_own(folder, capfd):
     printed = capfd.readouterr()
     assert json.loads(printed.out)["problems"]
     assert printed.err.startswith("roel: no answer: ")
+    with pytest.raises(NoAnswerError) as caught:
+        local.check_data(str(folder))
+    assert caught.value.reason == "DATA_UNSOUND"
 
 
 def test_a_backup_is_a_folder_of_its_own(folder, tmp_path, capfd):
