@@ -135,7 +135,8 @@ def leaf_commands() -> list[tuple[str, ...]]:
 
 def test_all_commands_of_the_contract_exist() -> None:
     expected = {"map build", "map info", "map export", "evaluate map", "config show"}
-    expected |= {"serve", "simulate", "demo", "health", "bench mapping"}
+    expected |= {"serve", "simulate", "demo", "health", "bench mapping", "register"}
+    expected |= {"admin fsck", "admin backup", "admin gc"}
     assert {" ".join(words) for words in leaf_commands()} == expected
 
 

@@ -7,7 +7,7 @@ from roel_service.store.builds import BuiltVersion
 from roel_service.store.fsck import check_folder
 from roel_service.store.store import Store
 
-from .samples import CAMERA, LIMIT_BYTES, chunk, finalized, leased
+from .samples import CAMERA, append, chunk, finalized, leased
 
 BUILT = BuiltVersion(rlm_bytes=b"map", line_count=3, bounds_m=[0.0] * 6, report={})
 
@@ -17,7 +17,7 @@ def full(store):
     """A frozen and an open recording, and a map with a built, a running and a failed version."""
     finalized(store)
     store.event_streams.create("open", CAMERA)
-    store.event_streams.append_chunks("open", [chunk(0), chunk(1)], LIMIT_BYTES)
+    append(store.event_streams, "open", chunk(0), chunk(1))
     store.maps.create("house")
     store.operations.succeed(leased(store, store.builds.begin("house", "walk")), BUILT)
     store.operations.preview(leased(store, store.builds.begin("house", "walk")), BUILT)
@@ -100,7 +100,7 @@ def test_a_backup_takes_the_place_of_its_folder(full, folder, tmp_path):
     assert findings.problems == []
     with Store(tmp_path / "copy") as copy:
         assert copy.maps.map_file(copy.maps.version("house", 1)) == b"map"
-        appended = copy.event_streams.append_chunks("open", [chunk(2)], LIMIT_BYTES)
+        appended = append(copy.event_streams, "open", chunk(2))
         assert appended.chunk_count == 3
         assert len(copy.operations.unfinished()) == 1
 
