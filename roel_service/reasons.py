@@ -96,6 +96,8 @@ _ROWS = (
     Reason(
         "UPLOAD_ORDER", InputError, "an upload that does not begin with the name of its recording"
     ),
+    Reason("PART_CRC_MISMATCH", InputError, "a part of a blob that was damaged on its way"),
+    Reason("PART_INVALID", InputError, "a part that no blob of the declared size has"),
     Reason("INSECURE_HOST", InputError, "serving another host than loopback without `--insecure`"),
     Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
     Reason("DATA_UNSOUND", NoAnswerError, "a data folder in which a check found problems"),
@@ -110,7 +112,7 @@ _ROWS = (
     Reason("STREAM_FINALIZED", StateError, "an upload to a recording that is frozen"),
     Reason("STREAM_NOT_FINALIZED", StateError, "a build from a recording that is still open"),
     Reason("NO_POSES", StateError, "a build from a recording without poses"),
-    Reason("SEQUENCE_GAP", StateError, "a chunk that is not the next one"),
+    Reason("SEQUENCE_GAP", StateError, "a chunk or part that is not the next one"),
     Reason("STREAM_IN_USE", StateError, "deleting a recording that a build reads"),
     Reason("MAP_IN_USE", StateError, "deleting a map or a version that is being made"),
     Reason("MAP_NOT_ACTIVE", StateError, "a version that is not complete, or deleted"),
@@ -127,7 +129,9 @@ _ROWS = (
     Reason("CONFLICT", ConflictError, "somebody else was faster, for no reason listed below"),
     Reason("ALREADY_EXISTS", ConflictError, "creating what exists"),
     Reason("ETAG_MISMATCH", ConflictError, "changing what was changed since it was read"),
-    Reason("CHUNK_CONFLICT", ConflictError, "a chunk that was stored before with other bytes"),
+    Reason(
+        "CHUNK_CONFLICT", ConflictError, "a chunk or part that was stored before with other bytes"
+    ),
     Reason("WRITER_REPLACED", ConflictError, "an upload that another one took over"),
     Reason("LIMIT_EXCEEDED", LimitError, "something too large, for no reason listed below"),
     Reason("EVENT_STREAM_TOO_LARGE", LimitError, "a recording beyond the server's limit"),
@@ -138,6 +142,7 @@ _ROWS = (
         "more uploads at a time than the server takes",
         retry_after_s=5.0,
     ),
+    Reason("BLOB_TOO_LARGE", LimitError, "a blob, or a part of one, beyond the server's limit"),
     Reason("TOO_MANY_POSES", LimitError, "more poses than the server takes"),
     Reason("TOO_MANY_ALIASES", LimitError, "more aliases of a map than the server takes"),
     Reason("QUEUE_FULL", LimitError, "more work than the server lets wait", retry_after_s=5.0),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
 
-from roel_service.errors import EventsError, InputError
+from roel_service.errors import EventsError
 from roel_service.scene.camera import Camera
 from roel_service.service.settings import Settings
+from roel_service.service.uploads import request_part
 from roel_service.store.event_streams import Chunk, EventStreams
 from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import events_pb2
@@ -58,14 +58,6 @@ class EventSink:
                 longest_gap_us=record.longest_gap_us,
             ),
         )
-
-
-def request_part(request: Any, name: str) -> Any:
-    """The part of an upload's message that has to be there; raises `InputError` UPLOAD_ORDER."""
-    found = request.WhichOneof("part")
-    if found != name:
-        raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
-    return getattr(request, name)
 
 
 def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:

@@ -9,11 +9,11 @@ from typing import Any
 from google.protobuf.empty_pb2 import Empty
 
 from roel_service.errors import InputError, LimitError, TrajectoryError
-from roel_service.service.append import EventSink, request_part
+from roel_service.service.append import EventSink
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
 from roel_service.service.settings import Settings
-from roel_service.service.uploads import OpenUploads, Upload, next_request
+from roel_service.service.uploads import OpenUploads, Upload, next_request, request_part
 from roel_service.store.event_streams import EventStreams, PosePart
 from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import events_pb2, types_pb2
@@ -50,7 +50,7 @@ class EventStreamServicer:
         record = await asyncio.to_thread(self._streams.take_over, stream_id)
         sink = EventSink(self._streams, record, self._settings)
         upload = Upload(requests, sink, self._settings)
-        with self._uploads.entered(stream_id, record.fence, upload):
+        with self._uploads.entered(f"recording {stream_id}", record.fence, upload):
             yield await asyncio.to_thread(sink.status)
             async for status in upload.statuses():
                 yield status

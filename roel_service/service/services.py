@@ -7,6 +7,7 @@ from typing import Any
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_service.jobs.scheduler import Scheduler
+from roel_service.service.blobs import BlobServicer
 from roel_service.service.capabilities import CapabilitiesServicer
 from roel_service.service.event_streams import EventStreamServicer
 from roel_service.service.maps import MapServicer
@@ -16,6 +17,8 @@ from roel_service.service.settings import Settings
 from roel_service.service.uploads import OpenUploads
 from roel_service.store.store import Store
 from roel_service.v1 import (
+    blobs_pb2,
+    blobs_pb2_grpc,
     capabilities_pb2,
     capabilities_pb2_grpc,
     events_pb2,
@@ -36,6 +39,7 @@ _DECLARED = {
         capabilities_pb2,
         capabilities_pb2_grpc.add_CapabilitiesServiceServicer_to_server,
     ),
+    "BlobService": (blobs_pb2, blobs_pb2_grpc.add_BlobServiceServicer_to_server),
     "EventStreamService": (
         events_pb2,
         events_pb2_grpc.add_EventStreamServiceServicer_to_server,
@@ -70,6 +74,7 @@ def add_services(server: Any, store: Store, scheduler: Scheduler, settings: Sett
     uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
         "EventStreamService": EventStreamServicer(store.event_streams, uploads, settings),
+        "BlobService": BlobServicer(store.uploads, uploads, settings),
         "MapService": MapServicer(store, scheduler, settings),
         "OperationService": operations,
         "Operations": operations,

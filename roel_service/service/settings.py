@@ -28,6 +28,8 @@ class Settings:
         task_time_s: wall clock of one attempt.
         retry_delay_s: mean time before a lost or broken attempt is tried again; it doubles.
         append_credit_chunks: event chunks of a call that may be under way at a time.
+        blob_bytes, blob_part_bytes: largest blob that is uploaded, and part of it.
+        blob_credit_bytes: bytes of a call that may be under way.
         open_uploads: uploads at a time.
         upload_silence_s: an upload that sends nothing for this long is ended.
         commit_interval_s, commit_bytes: what an upload sent is made durable when its first part is
@@ -53,6 +55,9 @@ class Settings:
     task_time_s: float = 3600.0
     retry_delay_s: float = 1.0
     append_credit_chunks: int = 16
+    blob_bytes: int = 10 * GIB
+    blob_part_bytes: int = MIB
+    blob_credit_bytes: int = 8 * MIB
     open_uploads: int = 64
     upload_silence_s: float = 60.0
     commit_interval_s: float = 0.02

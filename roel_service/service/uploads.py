@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from roel_service.errors import LimitError, RoelError, UnavailableError
+from roel_service.errors import InputError, LimitError, RoelError, UnavailableError
 from roel_service.service.settings import Settings
 from roel_service.store.event_streams import writer_replaced
 
@@ -201,6 +201,14 @@ async def next_request(requests: AsyncIterator[Any], settings: Settings) -> Any:
     except TimeoutError as error:
         expected = f"a message within {settings.upload_silence_s:g} s"
         raise UnavailableError("upload", expected, "silence", reason="UPLOAD_IDLE") from error
+
+
+def request_part(request: Any, name: str) -> Any:
+    """The part of an upload's message that has to be there; raises `InputError` UPLOAD_ORDER."""
+    found = request.WhichOneof("part")
+    if found != name:
+        raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
+    return getattr(request, name)
 
 
 def _is_sound(checking: asyncio.Task[Any]) -> bool:

@@ -53,10 +53,16 @@ class BlobStore:
         finally:
             temporary.unlink(missing_ok=True)
 
-    def adopt(self, source: Path) -> str:
-        """Store a file of the same file system durably; its own name stays for the caller."""
+    def adopt(self, source: Path, expected_sha256: str | None = None) -> str:
+        """Store a file of the same file system durably; its own name stays for the caller.
+
+        Raises:
+            CorruptionError: the file has another digest than expected; nothing is stored.
+        """
         with source.open("rb") as file:
             sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        if expected_sha256 not in (None, sha256):
+            raise CorruptionError("blob", f"bytes of digest {expected_sha256}", sha256)
         target = self.path(sha256)
         if not _renewed(target):
             sync_file(source)

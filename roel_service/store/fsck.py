@@ -32,6 +32,7 @@ from roel_service.store.schema import (
     OPERATION,
     POSE_PART,
     TASK,
+    UPLOAD,
 )
 
 # A server at work may move a file between two looks; what is wrong is so each time.
@@ -84,6 +85,7 @@ class _Check:
         self.database = Database(folder / "rows.sqlite")
         self._blobs = BlobStore(folder / "blobs" / "sha256")
         self._recordings = Recordings(folder / "recordings")
+        self._uploads = folder / "uploads"
 
     def problems(self) -> Iterator[str]:
         """All that is wrong."""
@@ -91,6 +93,7 @@ class _Check:
             _database_problems,
             self._blob_problems,
             self._stream_problems,
+            self._upload_problems,
             _version_problems,
             _alias_problems,
             _operation_problems,
@@ -133,6 +136,13 @@ class _Check:
             poses = select(func.coalesce(func.sum(POSE_PART.c.pose_count), 0))
             found = connection.scalar(poses.where(POSE_PART.c.stream_uid == stream["uid"]))
             yield from _unequal(f"recording {stream['id']}", "pose_count", stream, found)
+
+    def _upload_problems(self, connection: Connection) -> Iterator[str]:
+        for upload in connection.execute(select(UPLOAD)):
+            path = self._uploads / f"{upload.id}.part"
+            found = path.stat().st_size if path.exists() else 0
+            if found < upload.committed_bytes:
+                yield f"upload {upload.id}: {found} of {upload.committed_bytes} acknowledged bytes"
 
     def _chunk_problems(self, stream: RowMapping, chunks: list[RowMapping]) -> Iterator[str]:
         name = f"recording {stream['id']}"

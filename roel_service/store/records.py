@@ -242,6 +242,35 @@ class TaskRecord:
         return Lease(task_id=self.id, operation_id=self.operation_id, fence=self.fence)
 
 
+@dataclass(frozen=True, kw_only=True)
+class BlobRecord:
+    """A blob that is kept because it may be needed."""
+
+    sha256: str
+    size_bytes: int
+    create_time_us: int
+    last_used_us: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class UploadRecord:
+    """A blob on its way.
+
+    Attributes:
+        id: chosen by the client.
+        sha256, size_bytes: what it is to become.
+        committed_bytes: what is durable of it.
+        fence: number of the writer that may append; grows with every takeover.
+    """
+
+    id: str
+    sha256: str
+    size_bytes: int
+    committed_bytes: int
+    fence: int
+    expire_time_us: int
+
+
 def now_us() -> int:
     """Microseconds since 1970 (UTC)."""
     return time.time_ns() // 1000

@@ -8,3 +8,6 @@ DAY_US = 24 * 3600 * 1_000_000
 OPERATION_RETENTION_DAYS = 30
 DELETED_MAP_RETENTION_DAYS = 30
 REQUEST_RETENTION_DAYS = 7
+
+# From the last part of an upload, and from the last use of a blob that no row names.
+UPLOAD_RETENTION_DAYS = 1

@@ -161,3 +161,24 @@ Index("operation_expire_time", OPERATION.c.expire_time_us)
 Index("request_expire_time", REQUEST.c.expire_time_us)
 Index("map_purge_time", MAP.c.purge_time_us)
 Index("map_version_purge_time", MAP_VERSION.c.purge_time_us)
+
+# Blobs that were uploaded, or asked for: these rows keep them while nothing else names them.
+BLOB = Table(
+    "blob",
+    METADATA,
+    Column("sha256", String, primary_key=True),
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("create_time_us", BigInteger, nullable=False),
+    Column("last_used_us", BigInteger, nullable=False),
+)
+
+UPLOAD = Table(
+    "upload",
+    METADATA,
+    Column("id", String, primary_key=True),
+    Column("sha256", String, nullable=False),
+    Column("size_bytes", BigInteger, nullable=False),
+    Column("committed_bytes", BigInteger, nullable=False),
+    Column("fence", BigInteger, nullable=False),
+    Column("expire_time_us", BigInteger, nullable=False),
+)

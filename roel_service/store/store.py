@@ -1,4 +1,4 @@
-"""One data folder: `rows.sqlite`, `blobs/sha256`, `recordings`, and the lock on all of them."""
+"""One data folder: `rows.sqlite`, `blobs/sha256`, `recordings`, `uploads`, and the lock on all of them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
 from roel_service.store.requests import delete_expired_requests
 from roel_service.store.tasks import Tasks
+from roel_service.store.uploads import Uploads
 
 
 class Store:
     """What a server remembers; a context manager that holds the folder's lock.
 
     Attributes:
-        event_streams, maps, builds, operations, tasks: the repositories.
+        event_streams, uploads, maps, builds, operations, tasks: the repositories.
 
     Raises:
         InputError: a folder that cannot be created or written.
@@ -50,8 +51,10 @@ class Store:
                 self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
             )
             self.tasks = Tasks(self._database)
+            self.uploads = Uploads(self._database, self._blobs, folder / "uploads")
             # What a crash left of uploads; nothing is being written yet.
             self.event_streams.recover()
+            self.uploads.recover()
             self._resources = resources.pop_all()
 
     def __enter__(self) -> Store:
@@ -64,6 +67,7 @@ class Store:
         """Forget what has expired, then delete the blobs that no row names."""
         self.operations.delete_expired()
         self.maps.forget_deleted()
+        self.uploads.delete_expired()
         with self._database.write() as connection:
             delete_expired_requests(connection)
         return sweep_blobs(self._database, self._blobs, unused_for_s)

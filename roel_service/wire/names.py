@@ -10,6 +10,7 @@ PROJECT = "projects/default"
 LATEST = "latest"
 
 _ID = re.compile(r"[a-z][a-z0-9-]{2,62}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
 _OPERATION = re.compile(r"operations/([0-9a-f]{32})")
 _NUMBER = re.compile(r"v([1-9][0-9]{0,8})")
 _VERSION = re.compile(rf"(.+)/versions/(?:{_NUMBER.pattern}|({_ID.pattern}))")
@@ -71,6 +72,27 @@ def checked_alias(value: str) -> str:
         expected = f"an alias other than {LATEST} and the numbers of versions"
         raise InputError("alias", expected, repr(value), reason="ID_INVALID")
     return checked_id(value, "alias")
+
+
+def blob_name(sha256: str) -> str:
+    """The name of a blob."""
+    return f"{PROJECT}/blobs/{sha256}"
+
+
+def blob_sha256(name: str) -> str:
+    """The digest in a blob's name; raises `InputError` for any other text."""
+    sha256 = name.removeprefix(f"{PROJECT}/blobs/")
+    if sha256 == name or not _SHA256.fullmatch(sha256):
+        raise _bad_name(name, f"{PROJECT}/blobs/SHA256")
+    return sha256
+
+
+def checked_sha256(value: str) -> str:
+    """`value` if it is a digest; raises `InputError` ID_INVALID otherwise."""
+    if not _SHA256.fullmatch(value):
+        expected = "64 lower-case hexadecimal digits"
+        raise InputError("sha256", expected, repr(value), reason="ID_INVALID")
+    return value
 
 
 def operation_name(operation_id: str) -> str:

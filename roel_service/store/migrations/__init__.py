@@ -16,6 +16,7 @@ from roel_service.store.migrations import (
     m003_tasks,
     m004_maps_and_requests,
     m005_writers_of_recordings,
+    m006_uploads,
 )
 
 # Step k leads from version k to k + 1.
@@ -25,6 +26,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m003_tasks.migrate,
     m004_maps_and_requests.migrate,
     m005_writers_of_recordings.migrate,
+    m006_uploads.migrate,
 )
 
 
