@@ -21,6 +21,8 @@ FAILPOINTS = (
     "blob.written",
     "blob.synced",
     "blob.linked",
+    "upload.written",
+    "upload.synced",
     "rows.written",
     "rows.committed",
     "task.leased",

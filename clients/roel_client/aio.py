@@ -11,13 +11,14 @@ import contextlib
 import hashlib
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_client.connection import AsyncConnection, Endpoint, Tls
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
-from roel_client.uploads import EventUpload
+from roel_client.uploads import BlobDownload, BlobUpload, EventUpload
 from roel_service.config.stages import Config
 from roel_service.errors import CorruptionError, RoelError
 from roel_service.progress import ProgressCallback, ignore
@@ -25,6 +26,8 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.trajectory import Trajectory
 from roel_service.v1 import (
+    blobs_pb2,
+    blobs_pb2_grpc,
     capabilities_pb2,
     capabilities_pb2_grpc,
     events_pb2,
@@ -80,6 +83,7 @@ class AsyncClient:
         self._connection = AsyncConnection(endpoint)
         channel = self._connection.channel
         self._capabilities = capabilities_pb2_grpc.CapabilitiesServiceStub(channel)
+        self._blobs = blobs_pb2_grpc.BlobServiceStub(channel)
         self._streams = events_pb2_grpc.EventStreamServiceStub(channel)
         self._maps = maps_pb2_grpc.MapServiceStub(channel)
 
@@ -167,6 +171,23 @@ class AsyncClient:
         request = events_pb2.DeleteEventStreamRequest(name=name)
         await self._connection.call(self._streams.DeleteEventStream, request)
 
+    async def upload_blob(
+        self, path: Path, progress: ProgressCallback = ignore
+    ) -> types_pb2.BlobRef:
+        """Upload a file, unless the server has it; a broken upload is taken up where it ended."""
+        upload = await self._connection.run(BlobUpload, path, progress)
+        await _resumed(lambda: self._write_blob(upload), lambda: upload.committed_bytes)
+        return upload.blob
+
+    async def download_blob(self, sha256: str, path: Path) -> None:
+        """Fetch a blob as a file; raises `CorruptionError` unless it is what its name says."""
+        download = BlobDownload(sha256, path)
+        try:
+            await _resumed(lambda: self._read_blob(download), lambda: download.received_bytes)
+            download.finish()
+        finally:
+            download.close()
+
     async def create_map(self, map_id: str) -> str:
         """Name a map; its resource name."""
         request = maps_pb2.CreateMapRequest(parent=names.PROJECT, map_id=map_id)
@@ -217,6 +238,27 @@ class AsyncClient:
             await exchange.finish()
             while (status := await exchange.receive()) is not None:
                 upload.acknowledge(status)
+
+    async def _write_blob(self, upload: BlobUpload) -> None:
+        async with self._connection.exchange(self._blobs.WriteBlob) as exchange:
+            await exchange.send(upload.header())
+            status = await exchange.receive()
+            upload.restart(status)
+            while (part := await self._connection.run(upload.next_part)) is not None:
+                while not upload.has_credit():
+                    upload.acknowledge(await exchange.receive())
+                await exchange.send(part)
+            await exchange.send(blobs_pb2.WriteBlobRequest(finish=blobs_pb2.WriteBlobFinish()))
+            await exchange.finish()
+            while not status.HasField("blob"):
+                status = await exchange.receive()
+                upload.acknowledge(status)
+
+    async def _read_blob(self, download: BlobDownload) -> None:
+        answers = self._connection.stream(self._blobs.ReadBlob, download.request())
+        async with contextlib.aclosing(answers):
+            async for answer in answers:
+                await self._connection.run(download.receive, answer)
 
     @contextlib.asynccontextmanager
     async def _temporary_stream(self, camera: Camera) -> AsyncIterator[str]:

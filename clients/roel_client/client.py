@@ -8,13 +8,14 @@ import hashlib
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_client.connection import Connection, Endpoint, Tls
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
-from roel_client.uploads import EventUpload
+from roel_client.uploads import BlobDownload, BlobUpload, EventUpload
 from roel_service.config.stages import Config
 from roel_service.errors import CorruptionError, RoelError
 from roel_service.progress import ProgressCallback, ignore
@@ -22,6 +23,8 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.trajectory import Trajectory
 from roel_service.v1 import (
+    blobs_pb2,
+    blobs_pb2_grpc,
     capabilities_pb2,
     capabilities_pb2_grpc,
     events_pb2,
@@ -77,6 +80,7 @@ class Client:
         self._connection = Connection(endpoint)
         channel = self._connection.channel
         self._capabilities = capabilities_pb2_grpc.CapabilitiesServiceStub(channel)
+        self._blobs = blobs_pb2_grpc.BlobServiceStub(channel)
         self._streams = events_pb2_grpc.EventStreamServiceStub(channel)
         self._maps = maps_pb2_grpc.MapServiceStub(channel)
 
@@ -162,6 +166,21 @@ class Client:
         request = events_pb2.DeleteEventStreamRequest(name=name)
         self._connection.call(self._streams.DeleteEventStream, request)
 
+    def upload_blob(self, path: Path, progress: ProgressCallback = ignore) -> types_pb2.BlobRef:
+        """Upload a file, unless the server has it; a broken upload is taken up where it ended."""
+        upload = self._connection.run(BlobUpload, path, progress)
+        _resumed(lambda: self._write_blob(upload), lambda: upload.committed_bytes)
+        return upload.blob
+
+    def download_blob(self, sha256: str, path: Path) -> None:
+        """Fetch a blob as a file; raises `CorruptionError` unless it is what its name says."""
+        download = BlobDownload(sha256, path)
+        try:
+            _resumed(lambda: self._read_blob(download), lambda: download.received_bytes)
+            download.finish()
+        finally:
+            download.close()
+
     def create_map(self, map_id: str) -> str:
         """Name a map; its resource name."""
         request = maps_pb2.CreateMapRequest(parent=names.PROJECT, map_id=map_id)
@@ -212,6 +231,27 @@ class Client:
             exchange.finish()
             while (status := exchange.receive()) is not None:
                 upload.acknowledge(status)
+
+    def _write_blob(self, upload: BlobUpload) -> None:
+        with self._connection.exchange(self._blobs.WriteBlob) as exchange:
+            exchange.send(upload.header())
+            status = exchange.receive()
+            upload.restart(status)
+            while (part := self._connection.run(upload.next_part)) is not None:
+                while not upload.has_credit():
+                    upload.acknowledge(exchange.receive())
+                exchange.send(part)
+            exchange.send(blobs_pb2.WriteBlobRequest(finish=blobs_pb2.WriteBlobFinish()))
+            exchange.finish()
+            while not status.HasField("blob"):
+                status = exchange.receive()
+                upload.acknowledge(status)
+
+    def _read_blob(self, download: BlobDownload) -> None:
+        answers = self._connection.stream(self._blobs.ReadBlob, download.request())
+        with contextlib.closing(answers):
+            for answer in answers:
+                self._connection.run(download.receive, answer)
 
     @contextlib.contextmanager
     def _temporary_stream(self, camera: Camera) -> Iterator[str]:

@@ -6,20 +6,27 @@ acknowledged is kept, so that nothing is encoded twice and nothing acknowledged 
 
 from __future__ import annotations
 
+import hashlib
 import os
+import zlib
 from collections import deque
 from collections.abc import Generator
 from dataclasses import dataclass
+from pathlib import Path
 
-from roel_service.errors import UnavailableError
+from roel_service.errors import CorruptionError, UnavailableError
 from roel_service.in_order import in_order
 from roel_service.progress import Progress, ProgressCallback
 from roel_service.scene.events import EventSource, EventStream
-from roel_service.v1 import events_pb2
+from roel_service.v1 import blobs_pb2, events_pb2, types_pb2
+from roel_service.wire import names
 from roel_service.wire.chunks import encode_chunk, split_chunks
 
 # More threads than this would encode faster than any server checks.
 MAX_ENCODER_COUNT = 4
+
+# The most that a server takes at a time.
+BLOB_PART_BYTES = 2**20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,3 +115,103 @@ class EventUpload:
         seq, events = numbered
         data = b"" if seq < self.committed_seq else encode_chunk(events)
         return EncodedChunk(seq=seq, event_count=len(events), data=data)
+
+
+class BlobUpload:
+    """A file on its way into a blob.
+
+    Attributes:
+        blob: what it is to become.
+        committed_bytes: so many of its bytes are durable.
+    """
+
+    def __init__(self, path: Path, progress: ProgressCallback) -> None:
+        self._path = path
+        self._progress = progress
+        self._offset = 0
+        self._credit_bytes = 0
+        self.committed_bytes = 0
+        with path.open("rb") as file:
+            sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+        self.blob = types_pb2.BlobRef(sha256=sha256, size_bytes=path.stat().st_size)
+
+    def header(self) -> blobs_pb2.WriteBlobRequest:
+        """The first message; equal files continue one upload."""
+        upload_id = f"file-{self.blob.sha256[:32]}"
+        header = blobs_pb2.WriteBlobHeader(
+            parent=names.PROJECT, blob=self.blob, upload_id=upload_id
+        )
+        return blobs_pb2.WriteBlobRequest(header=header)
+
+    def restart(self, status: blobs_pb2.WriteStatus | None) -> None:
+        """A new call began with this status."""
+        self.acknowledge(status)
+        self._offset = self.committed_bytes
+
+    def acknowledge(self, status: blobs_pb2.WriteStatus | None) -> None:
+        """The server said what is durable; raises `UnavailableError` if it said nothing."""
+        if status is None:
+            raise UnavailableError("upload", "an acknowledgement", "the end of the call")
+        self._credit_bytes = status.credit_bytes
+        self.committed_bytes = status.committed_bytes
+        size_bytes = self.blob.size_bytes
+        told = Progress(
+            stage="upload",
+            done_count=self.committed_bytes,
+            total_count=size_bytes,
+            fraction=self.committed_bytes / size_bytes if size_bytes else 1.0,
+        )
+        self._progress(told)
+
+    def next_part(self) -> blobs_pb2.WriteBlobRequest | None:
+        """What to send next, None after the last."""
+        with self._path.open("rb") as file:
+            file.seek(self._offset)
+            data = file.read(BLOB_PART_BYTES)
+        part = blobs_pb2.BlobPart(offset=self._offset, data=data, crc32=zlib.crc32(data))
+        self._offset += len(data)
+        return blobs_pb2.WriteBlobRequest(data=part) if data else None
+
+    def has_credit(self) -> bool:
+        """Whether the server would take what `next_part` gave last."""
+        return self._offset <= self.committed_bytes + self._credit_bytes
+
+
+class BlobDownload:
+    """A blob on its way into a file, which appears when it is whole.
+
+    Attributes:
+        received_bytes: so many bytes are there.
+    """
+
+    def __init__(self, blob_sha256: str, path: Path) -> None:
+        self._sha256 = blob_sha256
+        self._path = path
+        self._part = path.with_name(f"{path.name}.part")
+        self._digest = hashlib.sha256()
+        self.received_bytes = 0
+        self._part.write_bytes(b"")
+
+    def request(self) -> blobs_pb2.ReadBlobRequest:
+        """Asks for what is missing."""
+        return blobs_pb2.ReadBlobRequest(
+            name=names.blob_name(self._sha256), offset=self.received_bytes
+        )
+
+    def receive(self, response: blobs_pb2.ReadBlobResponse) -> None:
+        """The next bytes came."""
+        with self._part.open("ab") as file:
+            file.write(response.data)
+        self._digest.update(response.data)
+        self.received_bytes += len(response.data)
+
+    def finish(self) -> None:
+        """Give the file its name; raises `CorruptionError` unless it is what was asked for."""
+        found = self._digest.hexdigest()
+        if found != self._sha256:
+            raise CorruptionError("blob", f"bytes of digest {self._sha256}", found)
+        self._part.replace(self._path)
+
+    def close(self) -> None:
+        """Leave nothing half behind."""
+        self._part.unlink(missing_ok=True)

@@ -31,7 +31,7 @@ def back_up(folder: Path, target: Path) -> Findings:
         raise InputError(str(folder), "a data folder", "none")
     for _ in range(ATTEMPT_COUNT):
         _copy_rows(folder / ROWS, target / ROWS)
-        for name in ("blobs", "recordings"):
+        for name in ("blobs", "recordings", "uploads"):
             _copy_files(folder / name, target / name)
         findings = check_folder(target)
         if not findings.problems:

@@ -139,7 +139,7 @@ class _Check:
 
     def _upload_problems(self, connection: Connection) -> Iterator[str]:
         for upload in connection.execute(select(UPLOAD)):
-            path = self._uploads / f"{upload.id}.part"
+            path = self._uploads / f"{upload.id}.upload"
             found = path.stat().st_size if path.exists() else 0
             if found < upload.committed_bytes:
                 yield f"upload {upload.id}: {found} of {upload.committed_bytes} acknowledged bytes"

@@ -145,14 +145,14 @@ class Uploads:
         with self._database.read() as connection:
             rows = connection.execute(select(UPLOAD.c.id, UPLOAD.c.committed_bytes))
             committed_bytes = {row.id: row.committed_bytes for row in rows}
-        for path in self._folder.glob("*.part"):
+        for path in self._folder.glob("*.upload"):
             if path.stem not in committed_bytes:
                 path.unlink()
             elif path.stat().st_size > committed_bytes[path.stem]:
                 os.truncate(path, committed_bytes[path.stem])
 
     def _path(self, upload_id: str) -> Path:
-        return self._folder / f"{upload_id}.part"
+        return self._folder / f"{upload_id}.upload"
 
     def _begin(
         self, connection: Connection, upload_id: str, sha256: str, size_bytes: int
