@@ -12,7 +12,7 @@ from sqlalchemy import Connection, create_engine, event
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from roel_service.failpoints import failpoint
-from roel_service.store.migrations import check_version, migrate
+from roel_service.store.migrations import check_version, is_current, migrate
 
 PRAGMAS = (
     "PRAGMA journal_mode = WAL",
@@ -40,6 +40,11 @@ class Database:
         """Raise `StateError` DATA_TOO_NEW or DATA_TOO_OLD unless the tables are of this release."""
         with self.read() as connection:
             check_version(connection)
+
+    def is_current(self) -> bool:
+        """Whether the tables are of the newest version."""
+        with self.read() as connection:
+            return is_current(connection)
 
     @contextmanager
     def write(self) -> Iterator[Connection]:

@@ -182,3 +182,24 @@ UPLOAD = Table(
     Column("fence", BigInteger, nullable=False),
     Column("expire_time_us", BigInteger, nullable=False),
 )
+
+PRINCIPAL = Table(
+    "principal",
+    METADATA,
+    Column("name", String, primary_key=True),
+    Column("role", String, nullable=False),
+    Column("token_sha256", String, nullable=False, unique=True),
+    Column("create_time_us", BigInteger, nullable=False),
+    Column("expire_time_us", BigInteger, nullable=False),
+)
+
+AUDIT = Table(
+    "audit",
+    METADATA,
+    Column("id", Integer, primary_key=True),
+    Column("time_us", BigInteger, nullable=False),
+    Column("principal", String, nullable=False),
+    Column("method", String, nullable=False),
+    Column("resource", String, nullable=False),
+    Column("code", String, nullable=False),
+)

@@ -9,6 +9,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from roel_service.errors import InputError, StateError
+from roel_service.store.audit import Audit
 from roel_service.store.blobs import BlobStore
 from roel_service.store.builds import Builds, VersionCompletion
 from roel_service.store.database import Database
@@ -17,11 +18,15 @@ from roel_service.store.files import make_folder
 from roel_service.store.garbage import LONGEST_UPLOAD_S, Swept, sweep_blobs
 from roel_service.store.maps import Maps
 from roel_service.store.operations import Operations
+from roel_service.store.principals import Principals
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
 from roel_service.store.requests import delete_expired_requests
 from roel_service.store.tasks import Tasks
 from roel_service.store.uploads import Uploads
+
+# A row has some 150 bytes.
+AUDIT_ROW_COUNT = 1_000_000
 
 
 class Store:
@@ -29,6 +34,7 @@ class Store:
 
     Attributes:
         event_streams, uploads, maps, builds, operations, tasks: the repositories.
+        principals, audit: who may call, and who changed what.
 
     Raises:
         InputError: a folder that cannot be created or written.
@@ -47,6 +53,8 @@ class Store:
             self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
             self.maps = Maps(self._database, self._blobs)
             self.builds = Builds(self._database)
+            self.principals = Principals(self._database)
+            self.audit = Audit(self._database, AUDIT_ROW_COUNT)
             self.operations = Operations(
                 self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
             )
@@ -71,6 +79,25 @@ class Store:
         with self._database.write() as connection:
             delete_expired_requests(connection)
         return sweep_blobs(self._database, self._blobs, unused_for_s)
+
+
+@contextmanager
+def opened_principals(folder: Path) -> Iterator[Principals]:
+    """The principals of a folder that a server may be using at the same time.
+
+    Raises:
+        InputError: a folder that cannot be created or written.
+        StateError: DATA_IN_USE, a server of an older release has the folder; DATA_TOO_NEW.
+    """
+    _check_folder(folder)
+    database = Database(folder / "rows.sqlite")
+    try:
+        if not database.is_current():
+            with _locked(folder):
+                database.migrate()
+        yield Principals(database)
+    finally:
+        database.close()
 
 
 def _check_folder(folder: Path) -> None:

@@ -17,6 +17,7 @@ from roel_service.store.migrations import (
     m004_maps_and_requests,
     m005_writers_of_recordings,
     m006_uploads,
+    m007_principals,
 )
 
 # Step k leads from version k to k + 1.
@@ -27,7 +28,14 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m004_maps_and_requests.migrate,
     m005_writers_of_recordings.migrate,
     m006_uploads.migrate,
+    m007_principals.migrate,
 )
+
+
+def is_current(connection: Connection) -> bool:
+    """Whether nothing is to be done."""
+    version = connection.execute(text("PRAGMA user_version")).scalar_one()
+    return bool(version == len(MIGRATIONS))
 
 
 def migrate(connection: Connection) -> None:
