@@ -11,6 +11,8 @@
     ├── LimitError          quota, full queue, too large
     ├── UnavailableError    draining, or the server cannot be reached
     ├── UnimplementedError  the protocol has the method, this server does not
+    ├── DeadlineError       the caller's deadline is too short to begin
+    ├── UnauthenticatedError  PermissionDeniedError   who calls is not known, or may not
     └── CorruptionError     stored bytes do not match their digest
     Cancelled               raised through a progress callback; not a fault
 
@@ -165,6 +167,24 @@ class UnimplementedError(RoelError):
     """The protocol has the method, this server does not."""
 
     default_reason = "METHOD_NOT_IMPLEMENTED"
+
+
+class DeadlineError(RoelError):
+    """The caller's deadline is too short for the work to begin."""
+
+    default_reason = "DEADLINE_TOO_SHORT"
+
+
+class UnauthenticatedError(RoelError):
+    """Nobody knows who calls."""
+
+    default_reason = "UNAUTHENTICATED"
+
+
+class PermissionDeniedError(RoelError):
+    """The caller may not do this; nothing is said about what the request names."""
+
+    default_reason = "PERMISSION_DENIED"
 
 
 class CorruptionError(RoelError):

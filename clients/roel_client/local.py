@@ -6,9 +6,12 @@ Files are named as the user gave them, because errors repeat the name.
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
     from roel_service.wire.rlm import MapFile
 
 RLM_MAGIC = b"RLM1"
+US_PER_DAY = 24 * 3600 * 1_000_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -81,12 +85,21 @@ def build_map(recording: Recording, config: Config, progress: ProgressCallback) 
 
 
 def build_map_remotely(
-    recording: Recording, config: Config, server: str, progress: ProgressCallback
+    recording: Recording,
+    config: Config,
+    progress: ProgressCallback,
+    server: str,
+    options: dict[str, Any],
 ) -> Built:
-    """Let a server build the map; raises as `build_map`, and `UnavailableError`."""
+    """Let a server build the map; raises as `build_map`, and `UnavailableError`.
+
+    Args:
+        server: `HOST:PORT`.
+        options: arguments of `Client` beside the address.
+    """
     from roel_client.client import Client
 
-    with naming(recording.names), Client(server) as client:
+    with naming(recording.names), Client(server, **options) as client:
         rlm_bytes, report = client.map_recording(
             recording.events, recording.trajectory, recording.camera, config, progress
         )
@@ -216,15 +229,76 @@ def simulate(folder: Path, seed: int, progress: ProgressCallback, **given: Any) 
     return simulate_dataset(folder, SimulationConfig(**given), seed, progress)
 
 
-def serve(
-    data: Path, host: str, port: int, *, insecure: bool, on_ready: Callable[[str], None]
-) -> None:
-    """Serve until SIGTERM or SIGINT; `on_ready` is told `HOST:PORT`."""
+def serve(data: Path, listen: dict[str, Any], on_ready: Callable[[str], None]) -> None:
+    """Serve until SIGTERM or SIGINT; `on_ready` is told `HOST:PORT`.
+
+    Args:
+        listen: fields of `Listen` that differ from its defaults.
+    """
     import asyncio
 
-    from roel_service.service import server
+    from roel_service.service.listen import Listen
+    from roel_service.service.server import serve
 
-    asyncio.run(server.serve(data, host, port, insecure=insecure, on_ready=on_ready))
+    asyncio.run(serve(data, Listen(**listen), on_ready=on_ready))
+
+
+@contextmanager
+def log_format(name: str | None) -> Iterator[None]:
+    """Write the log in a format that `roel_service.service.logs` names; None leaves it."""
+    from roel_service.service.logs import FORMATTERS
+
+    if name is None:
+        yield
+        return
+    handler = logging.StreamHandler()
+    handler.setFormatter(FORMATTERS[name]())
+    root = logging.getLogger()
+    previous = root.handlers
+    root.handlers = [handler]
+    try:
+        yield
+    finally:
+        root.handlers = previous
+
+
+def create_token(data: Path, name: str, role: str, days: int | None) -> str:
+    """Name a caller of the server on a folder; its token."""
+    from roel_service.store.principals import Role
+    from roel_service.store.records import now_us
+    from roel_service.store.store import opened_principals
+
+    expire_time_us = 0 if days is None else now_us() + days * US_PER_DAY
+    with opened_principals(data) as principals:
+        return principals.create(name, Role[role.upper()], expire_time_us)
+
+
+def list_tokens(data: Path) -> list[dict[str, Any]]:
+    """Who may call the server on a folder."""
+    from roel_service.store.store import opened_principals
+
+    with opened_principals(data) as principals:
+        return [
+            {
+                "name": item.name,
+                "role": item.role.label,
+                "created": _iso_time(item.create_time_us),
+                "expires": _iso_time(item.expire_time_us) if item.expire_time_us else None,
+            }
+            for item in principals.list()
+        ]
+
+
+def revoke_token(data: Path, name: str) -> None:
+    """Let a caller in no longer; raises `NotFoundError`."""
+    from roel_service.store.store import opened_principals
+
+    with opened_principals(data) as principals:
+        principals.revoke(name)
+
+
+def _iso_time(time_us: int) -> str:
+    return datetime.fromtimestamp(time_us / 1e6, UTC).isoformat(timespec="seconds")
 
 
 def check_data(folder: str) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from roel_service.errors import RoelError
+from roel_service.service.listen import Listen
 from roel_service.service.server import serve
 
 
@@ -26,9 +27,7 @@ def main() -> int:
         asyncio.run(
             serve(
                 options.data,
-                options.host,
-                options.port,
-                insecure=options.insecure,
+                Listen(host=options.host, port=options.port, insecure=options.insecure),
                 on_ready=_announce,
             )
         )

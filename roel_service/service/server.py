@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import ipaddress
 import logging
 import signal
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,16 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from roel_service.errors import InputError, UnavailableError
 from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.preparation import build_preparation
 from roel_service.jobs.scheduler import Policy, Scheduler
 from roel_service.jobs.upkeep import upkeep
-from roel_service.service.interceptors import ErrorInterceptor
+from roel_service.service.access import Access
+from roel_service.service.admin import Probes, admin_server
+from roel_service.service.calls import Guard, GuardInterceptor
+from roel_service.service.guards import CallLimits, Drain, told_errors
+from roel_service.service.listen import Listen
+from roel_service.service.observe import Auditing, Metrics, Observation
 from roel_service.service.services import SERVICES, add_services
 from roel_service.service.settings import Settings
 from roel_service.store.records import OperationMethod
@@ -30,50 +35,81 @@ logger = logging.getLogger(__name__)
 # A client that pings more often than this is told to calm down; ours pings every 20 s.
 MIN_PING_INTERVAL_MS = 10_000
 
+# Long-lived clients connect anew now and then, so that a balancer in between can spread them.
+CONNECTION_AGE_MS = 30 * 60_000
+CONNECTION_AGE_GRACE_MS = 10 * 60_000
+
+# After the drain calls only have their last answers to send.
+STOP_GRACE_S = 1.0
+
+# Messages are compressed by their own formats, whose sizes are checked; a message that gRPC
+# would have to inflate first is refused.
+IDENTITY_ONLY = 1
+
 DEFAULT_SETTINGS = Settings()
 
 
 async def serve(
     data: Path,
-    host: str,
-    port: int,
+    listen: Listen,
     *,
     on_ready: Callable[[str], None],
-    insecure: bool = False,
     settings: Settings = DEFAULT_SETTINGS,
 ) -> None:
-    """Serve until SIGTERM or SIGINT, then drain.
+    """Serve until SIGTERM or SIGINT, then drain; raises as `running`.
+
+    Args:
+        on_ready: called once with the address when calls are answered.
+    """
+    stop = _stop_at_signals()
+    async with running(data, listen, settings) as address:
+        on_ready(address)
+        await stop.wait()
+
+
+@asynccontextmanager
+async def running(
+    data: Path, listen: Listen, settings: Settings = DEFAULT_SETTINGS
+) -> AsyncIterator[str]:
+    """A server that drains at the end of the block; the address where it answers.
 
     Args:
         data: folder of all that the server keeps; created if it does not exist.
-        host, port: where to listen; port 0 takes a free one.
-        on_ready: called once with `HOST:PORT` when calls are answered.
-        insecure: allow a host other than loopback; the protocol is not encrypted yet.
 
     Raises:
-        InputError: a host that is not loopback.
-        StateError: another server uses the folder.
-        UnavailableError: the port is taken.
+        InputError: INSECURE_HOST, TLS_INVALID.
+        StateError: DATA_IN_USE, another server uses the folder; DATA_TOO_NEW.
+        UnavailableError: an address is taken.
     """
-    _check_host(host, insecure)
-    stop = _stop_at_signals()
-    with Store(data) as store:
+    credentials = listen.credentials()
+    async with AsyncExitStack() as resources:
+        store = resources.enter_context(Store(data))
         scheduler = _scheduler(store, settings)
         await scheduler.start()
+        drain, metrics = Drain(), Metrics(store)
         server = grpc.aio.server(
-            interceptors=[ErrorInterceptor()], options=_options(settings), compression=None
+            interceptors=[GuardInterceptor(_guards(store, settings, drain, metrics))],
+            options=_options(settings),
+            compression=None,
         )
         add_services(server, store, scheduler, settings)
         health_servicer = await _add_health(server)
-        address = _bind(server, host, port)
+        address = listen.bind(server, credentials)
+        if listen.admin is not None:
+            probes = Probes(metrics=metrics.page, problems=partial(_problems, store, drain))
+            told = await resources.enter_async_context(admin_server(*listen.admin, probes))
+            logger.warning("metrics and probes on http://%s", told)
         await server.start()
-        on_ready(address)
-        async with upkeep(store, settings.sweep_interval_s):
-            await stop.wait()
-        logger.info("draining")
-        await health_servicer.enter_graceful_shutdown()
-        await scheduler.drain()
-        await server.stop(settings.drain_grace_s)
+        try:
+            async with upkeep(store, settings.sweep_interval_s):
+                yield address
+        finally:
+            logger.info("draining")
+            await health_servicer.enter_graceful_shutdown()
+            drain.begin()
+            await scheduler.drain()
+            await drain.finish(settings.drain_grace_s)
+            await server.stop(STOP_GRACE_S)
 
 
 def _scheduler(store: Store, settings: Settings) -> Scheduler:
@@ -93,17 +129,22 @@ def _scheduler(store: Store, settings: Settings) -> Scheduler:
     )
 
 
-def _check_host(host: str, insecure: bool) -> None:
-    if not (insecure or host == "localhost" or _is_loopback(host)):
-        expected = "a loopback address, since calls are not encrypted (--insecure allows others)"
-        raise InputError("--host", expected, host, reason="INSECURE_HOST")
+def _guards(store: Store, settings: Settings, drain: Drain, metrics: Metrics) -> list[Guard]:
+    """Around every call, the outermost first."""
+    return [
+        told_errors,
+        Observation(metrics),
+        drain,
+        Auditing(store.audit),
+        Access(store.principals),
+        CallLimits(settings),
+    ]
 
 
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
+def _problems(store: Store, drain: Drain) -> list[str]:
+    """What keeps the server from working."""
+    problems = store.problems()
+    return ["draining", *problems] if drain.has_begun else problems
 
 
 def _stop_at_signals() -> asyncio.Event:
@@ -119,6 +160,9 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_send_message_length", settings.message_out_bytes),
         ("grpc.http2.min_recv_ping_interval_without_data_ms", MIN_PING_INTERVAL_MS),
         ("grpc.keepalive_permit_without_calls", 1),
+        ("grpc.max_connection_age_ms", CONNECTION_AGE_MS),
+        ("grpc.max_connection_age_grace_ms", CONNECTION_AGE_GRACE_MS),
+        ("grpc.compression_enabled_algorithms_bitset", IDENTITY_ONLY),
         # Otherwise a second server shares the port and takes half of the calls.
         ("grpc.so_reuseport", 0),
     ]
@@ -132,14 +176,3 @@ async def _add_health(server: Any) -> Any:
     served = (*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME)
     reflection.enable_server_reflection(served, server)
     return servicer
-
-
-def _bind(server: Any, host: str, port: int) -> str:
-    """Listen; the address that was bound."""
-    shown = f"[{host}]" if ":" in host else host
-    try:
-        bound = server.add_insecure_port(f"{shown}:{port}")
-    except RuntimeError as error:
-        found = "one that cannot be listened on"
-        raise UnavailableError(f"{shown}:{port}", "a free address", found) from error
-    return f"{shown}:{bound}"

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from sqlalchemy.exc import SQLAlchemyError
+
 from roel_service.errors import InputError, StateError
 from roel_service.store.audit import Audit
 from roel_service.store.blobs import BlobStore
@@ -43,6 +45,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         _check_folder(folder)
+        self._folder = folder
         with ExitStack() as resources:
             resources.enter_context(_locked(folder))
             self._database = Database(folder / "rows.sqlite")
@@ -79,6 +82,17 @@ class Store:
         with self._database.write() as connection:
             delete_expired_requests(connection)
         return sweep_blobs(self._database, self._blobs, unused_for_s)
+
+    def problems(self) -> list[str]:
+        """What keeps the store from working, a sentence each."""
+        problems = []
+        try:
+            self.principals.is_empty()
+        except SQLAlchemyError as error:
+            problems.append(f"the database cannot be read: {type(error).__name__}")
+        if not os.access(self._folder, os.W_OK | os.X_OK):
+            problems.append("the data folder cannot be written")
+        return problems
 
 
 @contextmanager

@@ -30,6 +30,9 @@ CODES: tuple[tuple[type[RoelError], int], ...] = (
     (errors.LimitError, code_pb2.RESOURCE_EXHAUSTED),
     (errors.UnavailableError, code_pb2.UNAVAILABLE),
     (errors.UnimplementedError, code_pb2.UNIMPLEMENTED),
+    (errors.DeadlineError, code_pb2.DEADLINE_EXCEEDED),
+    (errors.UnauthenticatedError, code_pb2.UNAUTHENTICATED),
+    (errors.PermissionDeniedError, code_pb2.PERMISSION_DENIED),
     (errors.CorruptionError, code_pb2.DATA_LOSS),
     (errors.RoelError, code_pb2.INTERNAL),
 )
@@ -50,6 +53,8 @@ FALLBACK: dict[int, type[RoelError]] = {
     code_pb2.UNAVAILABLE: errors.UnavailableError,
     code_pb2.DEADLINE_EXCEEDED: errors.UnavailableError,
     code_pb2.UNIMPLEMENTED: errors.UnimplementedError,
+    code_pb2.UNAUTHENTICATED: errors.UnauthenticatedError,
+    code_pb2.PERMISSION_DENIED: errors.PermissionDeniedError,
     code_pb2.DATA_LOSS: errors.CorruptionError,
 }
 

@@ -25,13 +25,14 @@ CAMERA = Camera(width=64, height=48, fx_px=50.0, fy_px=50.0, cx_px=32.0, cy_px=2
 class Server:
     """A server process on a folder; `log` is what it wrote to stderr so far."""
 
-    def __init__(self, folder, port=0, **settings):
+    def __init__(self, folder, port=0, listen=None, **settings):
         self.folder = folder
         self.folder.mkdir(exist_ok=True)
         self._log_file = folder.with_suffix(".log")
         self.pid_file = folder.with_suffix(".pid")
         environment = {**os.environ, "SAMPLE_BUILD_PID": str(self.pid_file)}
-        command = [sys.executable, SCRIPT, folder, str(port), json.dumps(settings)]
+        command = [sys.executable, SCRIPT, folder, json.dumps({"port": port, **(listen or {})})]
+        command.append(json.dumps(settings))
         with self._log_file.open("ab") as log:
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment

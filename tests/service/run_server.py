@@ -1,6 +1,8 @@
-"""A server whose builds are those of `sample_builds`; settings come as JSON."""
+"""A server whose builds are those of `sample_builds`; where to listen and settings come as JSON."""
 
 import sys
+
+PATHS = ("tls_cert", "tls_key", "client_ca")
 
 
 def main():
@@ -10,14 +12,18 @@ def main():
     import logging
     from pathlib import Path
 
+    from roel_service.service.listen import Listen
     from roel_service.service.server import serve
     from roel_service.service.settings import Settings
 
     logging.basicConfig(level=logging.INFO)
-    folder, port, settings = sys.argv[1:]
+    folder, listen, settings = sys.argv[1:]
     defaults = {"build_entrypoint": "sample_builds:build", "retry_delay_s": 0.05}
     chosen = Settings(**{**defaults, **json.loads(settings)})
-    serving = serve(Path(folder), "127.0.0.1", int(port), on_ready=announce, settings=chosen)
+    where = {
+        name: Path(value) if name in PATHS else value for name, value in json.loads(listen).items()
+    }
+    serving = serve(Path(folder), Listen(**where), on_ready=announce, settings=chosen)
     asyncio.run(serving)
 
 

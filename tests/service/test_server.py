@@ -19,6 +19,7 @@ from roel_client.connection import Connection, Endpoint
 from roel_service import __version__
 from roel_service.errors import InputError, RoelError, UnavailableError
 from roel_service.scene.results import MAPPING_STAGES
+from roel_service.service.listen import Listen
 from roel_service.service.server import serve
 from roel_service.service.services import SERVICES
 from roel_service.v1 import events_pb2, events_pb2_grpc
@@ -114,13 +115,13 @@ def test_a_folder_serves_one_server(server):
 
 def test_a_taken_port_is_told(server, folder):
     with pytest.raises(UnavailableError, match=f"{server.address}: expected a free address"):
-        asyncio.run(serve(folder, "127.0.0.1", server.port, on_ready=print))
+        asyncio.run(serve(folder, Listen(port=server.port), on_ready=print))
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org"])
 def test_only_loopback_is_served_without_encryption(folder, host):
     with pytest.raises(InputError, match="--host: expected a loopback address") as caught:
-        asyncio.run(serve(folder, host, 0, on_ready=print))
+        asyncio.run(serve(folder, Listen(host=host, port=0), on_ready=print))
     assert caught.value.reason == "INSECURE_HOST"
     assert not folder.exists()
 

@@ -13,7 +13,6 @@ from roel_client.cli.parser import (
     Command,
     Parser,
     Subparsers,
-    address,
     command,
     command_group,
     integer,
@@ -21,6 +20,7 @@ from roel_client.cli.parser import (
     suffixed,
 )
 from roel_client.cli.process import interruptible
+from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
 
 EXPORT_SUFFIXES = (".npz", ".ply", ".obj", ".json", ".csv", ".dxf")
@@ -52,9 +52,7 @@ def _add_build(group: Subparsers) -> None:
         help="the map over the events and from above",
     )
     parser.add_argument("--seed", type=integer(0), metavar="N", help="fixes all randomness (0)")
-    parser.add_argument(
-        "--server", type=address, metavar="HOST:PORT", help="let this server build the map"
-    )
+    add_server_options(parser, required=False, what="let this server build the map")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
 
@@ -90,7 +88,9 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
         else:
             # A signal must reach the client, which then ends the build on the server too.
             with interruptible():
-                built = local.build_map_remotely(recording, config, options.server, progress)
+                built = local.build_map_remotely(
+                    recording, config, progress, options.server, server_options(options)
+                )
     staged["out"].write_bytes(built.rlm_bytes)
     report = {**built.report, "seconds_total": time.perf_counter() - started_s}
     if "report" in staged:

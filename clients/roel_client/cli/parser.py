@@ -152,6 +152,14 @@ def address(text: str) -> str:
     return text
 
 
+def endpoint(text: str) -> tuple[str, int]:
+    """Where to listen, written HOST:PORT; port 0 is any."""
+    match = re.fullmatch(r"\[?([^\s\[\]]+)\]?:([0-9]{1,5})", text)
+    if match is None or not int(match[2]) < 65536:
+        raise _mismatch("HOST:PORT", text)
+    return match[1], int(match[2])
+
+
 def suffixed(*suffixes: str) -> Callable[[str], str]:
     """A file name that ends in one of these."""
 

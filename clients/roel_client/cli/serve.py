@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from roel_client.cli.output import print_text, to_json
-from roel_client.cli.parser import Command, Subparsers, command, integer
+from roel_client.cli.parser import Command, Subparsers, command, endpoint, integer, one_of
 from roel_client.cli.staging import Staged
 
 
@@ -24,10 +24,30 @@ def add_commands(subparsers: Subparsers) -> None:
         metavar="N",
         help="port to listen on (50051); 0 takes a free one",
     )
+    parser.add_argument("--tls-cert", type=Path, metavar="FILE.pem", help="certificate to show")
+    parser.add_argument("--tls-key", type=Path, metavar="FILE.pem", help="its key")
+    parser.add_argument(
+        "--client-ca",
+        type=Path,
+        metavar="FILE.pem",
+        help="let in only clients with a certificate of these authorities",
+    )
     parser.add_argument(
         "--insecure",
         action="store_true",
         help="allow a host other than loopback, though calls are not encrypted",
+    )
+    parser.add_argument(
+        "--admin",
+        type=endpoint,
+        metavar="HOST:PORT",
+        help="serve /metrics, /livez and /readyz over HTTP here; port 0 takes a free one",
+    )
+    parser.add_argument(
+        "--log-format",
+        type=one_of("json", "text"),
+        metavar="FORMAT",
+        help="json (one object a line) or text; both with a line for every call at --log-level info",
     )
 
 
@@ -35,10 +55,13 @@ def serve(options: argparse.Namespace, staged: Staged) -> None:
     """Serve until SIGINT or SIGTERM; one JSON line on stdout says when and where."""
     from roel_client import local
 
-    local.serve(
-        Path(options.data),
-        options.host,
-        options.port,
-        insecure=options.insecure,
-        on_ready=lambda address: print_text(to_json({"address": address})),
-    )
+    listen = {
+        name: getattr(options, name)
+        for name in ("host", "port", "tls_cert", "tls_key", "client_ca", "insecure", "admin")
+    }
+    with local.log_format(options.log_format):
+        local.serve(
+            Path(options.data),
+            listen,
+            on_ready=lambda address: print_text(to_json({"address": address})),
+        )

@@ -1,0 +1,173 @@
+"""What an operator learns of every call: a line in the log, numbers, a row in the audit."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import sys
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from google.rpc import code_pb2
+
+from roel_service.errors import RoelError
+from roel_service.service.calls import Call
+from roel_service.service.metrics import Counter, Gauge, Histogram, Labels, exposition
+from roel_service.service.rules import rule_of
+from roel_service.store.audit import Audit
+from roel_service.store.records import OperationState
+from roel_service.store.store import Store
+from roel_service.wire.errors import code_of
+
+logger = logging.getLogger(__name__)
+
+# getrusage counts kibibytes, on macOS bytes.
+BYTES_PER_MAX_RSS = 1 if sys.platform == "darwin" else 2**10
+
+
+class Metrics:
+    """Every number that the server tells."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self.started = Counter(
+            name="roel_rpc_started_total", help="Calls begun.", label_names=("method",)
+        )
+        self.handled = Counter(
+            name="roel_rpc_handled_total", help="Calls ended.", label_names=("method", "code")
+        )
+        self.seconds = Histogram(
+            name="roel_rpc_seconds",
+            help="Seconds from a call's begin to its end.",
+            label_names=("method", "code"),
+        )
+        self.received_bytes = Counter(
+            name="roel_rpc_received_bytes_total",
+            help="Bytes of request messages.",
+            label_names=("method",),
+        )
+        self.sent_bytes = Counter(
+            name="roel_rpc_sent_bytes_total",
+            help="Bytes of answer messages.",
+            label_names=("method",),
+        )
+        self._looked_up = (
+            Gauge(
+                name="roel_operations",
+                help="Long-running operations that have not ended, by state.",
+                label_names=("state",),
+                read=self._operations,
+            ),
+            Gauge(
+                name="roel_process_cpu_seconds_total",
+                help="Processor seconds of the server without its children.",
+                kind="counter",
+                read=lambda: {(): time.process_time()},
+            ),
+            Gauge(
+                name="roel_process_peak_memory_bytes",
+                help="Largest resident memory of the server without its children so far.",
+                read=_peak_memory,
+            ),
+        )
+
+    def page(self) -> str:
+        """As Prometheus reads it."""
+        counted = (
+            self.started,
+            self.handled,
+            self.seconds,
+            self.received_bytes,
+            self.sent_bytes,
+        )
+        return exposition((*counted, *self._looked_up))
+
+    def _operations(self) -> dict[Labels, float]:
+        counts = dict.fromkeys((OperationState.QUEUED, OperationState.RUNNING), 0)
+        for record in self._store.operations.unfinished():
+            counts[record.state] += 1
+        return {(state.value,): count for state, count in counts.items()}
+
+
+def _peak_memory() -> dict[Labels, float]:
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    return {(): usage.ru_maxrss * BYTES_PER_MAX_RSS}
+
+
+class Observation:
+    """Counts every call and writes it to the log."""
+
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
+
+    @asynccontextmanager
+    async def __call__(self, call: Call) -> AsyncIterator[None]:
+        """Guard one call."""
+        start_s = time.perf_counter()
+        self._metrics.started.add(call.method)
+        code = "OK"
+        try:
+            yield
+        except BaseException as error:
+            code = code_name(error)
+            raise
+        finally:
+            self._tell(call, code, time.perf_counter() - start_s)
+
+    def _tell(self, call: Call, code: str, spent_s: float) -> None:
+        metrics = self._metrics
+        metrics.handled.add(call.method, code)
+        metrics.seconds.observe(call.method, code, value=spent_s)
+        metrics.received_bytes.add(call.method, amount=call.received_bytes)
+        metrics.sent_bytes.add(call.method, amount=call.sent_bytes)
+        fields = {
+            "request_id": call.request_id,
+            "method": call.method,
+            "code": code,
+            "ms": round(1000 * spent_s, 3),
+            "principal": call.principal.name if call.principal else "",
+            "peer": call.context.peer(),
+            "resource": call.resource,
+            "operation": call.operation,
+            "received_bytes": call.received_bytes,
+            "sent_bytes": call.sent_bytes,
+        }
+        logger.info(
+            "call", extra={"fields": {key: value for key, value in fields.items() if value}}
+        )
+
+
+class Auditing:
+    """Leaves a row for every call of somebody known that may change something, refused or not."""
+
+    def __init__(self, audit: Audit) -> None:
+        self._audit = audit
+
+    @asynccontextmanager
+    async def __call__(self, call: Call) -> AsyncIterator[None]:
+        """Guard one call."""
+        code = "OK"
+        try:
+            yield
+        except BaseException as error:
+            code = code_name(error)
+            raise
+        finally:
+            if rule_of(call.method).audited and call.principal is not None:
+                # The row is written also when the call was cancelled just now.
+                await asyncio.shield(asyncio.to_thread(self._add, call, code))
+
+    def _add(self, call: Call, code: str) -> None:
+        assert call.principal is not None
+        self._audit.add(
+            principal=call.principal.name, method=call.method, resource=call.resource, code=code
+        )
+
+
+def code_name(error: BaseException) -> str:
+    """The gRPC code with which a call ends that raised this."""
+    if isinstance(error, RoelError):
+        return str(code_pb2.Code.Name(code_of(type(error))))
+    return "INTERNAL" if isinstance(error, Exception) else "CANCELLED"
