@@ -32,6 +32,7 @@ WORDS = {
     "__aexit__": "__exit__",
     "__aiter__": "__iter__",
     "__anext__": "__next__",
+    "async_served": "served",
     "aclosing": "closing",
     "asynccontextmanager": "contextmanager",
     "asyncio": "time",

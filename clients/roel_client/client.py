@@ -14,6 +14,7 @@ from typing import TypeVar
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_client.connection import Connection, Endpoint, Tls
+from roel_client.embedded import served
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
 from roel_client.uploads import BlobDownload, BlobUpload, EventUpload
 from roel_service.config.stages import Config
@@ -83,6 +84,17 @@ class Client:
         self._blobs = blobs_pb2_grpc.BlobServiceStub(channel)
         self._streams = events_pb2_grpc.EventStreamServiceStub(channel)
         self._maps = maps_pb2_grpc.MapServiceStub(channel)
+
+    @classmethod
+    @contextlib.contextmanager
+    def embedded(cls, data: Path) -> Iterator[Client]:
+        """A client of a server in this process, on a folder of its own; no port is opened.
+
+        Raises:
+            StateError: DATA_IN_USE, a server uses the folder.
+        """
+        with served(data) as address, cls(address) as client:
+            yield client
 
     def __enter__(self) -> Client:
         return self

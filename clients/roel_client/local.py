@@ -229,18 +229,23 @@ def simulate(folder: Path, seed: int, progress: ProgressCallback, **given: Any) 
     return simulate_dataset(folder, SimulationConfig(**given), seed, progress)
 
 
-def serve(data: Path, listen: dict[str, Any], on_ready: Callable[[str], None]) -> None:
-    """Serve until SIGTERM or SIGINT; `on_ready` is told `HOST:PORT`.
+def serve(data: Path, listen: dict[str, Any], on_ready: Callable[[dict[str, str]], None]) -> None:
+    """Serve until SIGTERM or SIGINT.
 
     Args:
         listen: fields of `Listen` that differ from its defaults.
+        on_ready: is told the `address`, and that of `admin` if there is one.
     """
     import asyncio
 
     from roel_service.service.listen import Listen
-    from roel_service.service.server import serve
+    from roel_service.service.server import Addresses, serve
 
-    asyncio.run(serve(data, Listen(**listen), on_ready=on_ready))
+    def tell(addresses: Addresses) -> None:
+        admin = {} if addresses.admin is None else {"admin": addresses.admin}
+        on_ready({"address": addresses.calls, **admin})
+
+    asyncio.run(serve(data, Listen(**listen), on_ready=tell))
 
 
 @contextmanager

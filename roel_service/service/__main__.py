@@ -11,7 +11,7 @@ from pathlib import Path
 
 from roel_service.errors import RoelError
 from roel_service.service.listen import Listen
-from roel_service.service.server import serve
+from roel_service.service.server import Addresses, serve
 
 
 def main() -> int:
@@ -37,8 +37,8 @@ def main() -> int:
     return 0
 
 
-def _announce(address: str) -> None:
-    sys.stdout.write(json.dumps({"address": address}) + "\n")
+def _announce(addresses: Addresses) -> None:
+    sys.stdout.write(json.dumps({"address": addresses.calls}) + "\n")
     sys.stdout.flush()
 
 

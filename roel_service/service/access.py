@@ -6,7 +6,6 @@ import asyncio
 import ipaddress
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 from urllib.parse import unquote
 
 from roel_service.errors import PermissionDeniedError, UnauthenticatedError
@@ -16,10 +15,7 @@ from roel_service.store.principals import Principal, Principals, Role
 
 BEARER = "Bearer "
 
-# What is known of a certificate's owner, the names that a client was given for itself.
-CERTIFICATE_NAMES = ("x509_subject_alternative_name", "x509_common_name")
-
-# Whoever sits at the machine, as long as nobody has been named.
+# Whoever sits at the machine, as long as nobody has been named, and whoever embeds the server.
 LOCAL_ADMIN = Principal(name="local", role=Role.ADMIN)
 
 
@@ -35,21 +31,21 @@ class Access:
     @asynccontextmanager
     async def __call__(self, call: Call) -> AsyncIterator[None]:
         """Guard one call; raises `UnauthenticatedError` or `PermissionDeniedError`."""
-        call.principal = await asyncio.to_thread(self._caller, call.context)
+        call.principal = await asyncio.to_thread(self._caller, call)
         needed = rule_of(call.method).role
         if call.principal.role < needed:
             expected, found = f"a caller with the role {needed.label}", call.principal.role.label
             raise PermissionDeniedError(call.method, expected, found)
         yield
 
-    def _caller(self, context: Any) -> Principal:
-        authorization = dict(context.invocation_metadata() or ()).get("authorization")
-        if authorization is not None:
-            return _known(self._of_token(authorization), "a token that is not known")
-        names = _certificate_names(context)
+    def _caller(self, call: Call) -> Principal:
+        if call.authorization is not None:
+            return _known(self._of_token(call.authorization), "a token that is not known")
+        names = call.certificate_names
         if names:
             return _known(self._principals.of_names(names), "a certificate of nobody known")
-        if is_local_peer(context.peer()) and self._principals.is_empty():
+        # Whoever can open a socket file can open the data folder too.
+        if is_socket_peer(call.peer) or (is_local_peer(call.peer) and self._principals.is_empty()):
             return LOCAL_ADMIN
         raise UnauthenticatedError("caller", "a token or a certificate", "neither")
 
@@ -65,20 +61,15 @@ def _known(principal: Principal | None, found: str) -> Principal:
     return principal
 
 
-def _certificate_names(context: Any) -> list[str]:
-    identity = context.auth_context()
-    return [
-        name.decode(errors="replace") for key in CERTIFICATE_NAMES for name in identity.get(key, ())
-    ]
+def is_socket_peer(peer: str) -> bool:
+    """Whether gRPC's name of a peer says that it came through a socket file."""
+    return peer.startswith("unix:")
 
 
 def is_local_peer(peer: str) -> bool:
-    """Whether gRPC's name of a peer is an address of this machine alone."""
-    family, _, address = unquote(peer).partition(":")
-    if family == "unix":
-        return True
-    host = address.rpartition(":")[0].strip("[]")
-    return is_loopback(host)
+    """Whether gRPC's name of a peer is an address that only this machine has."""
+    host = unquote(peer).partition(":")[2].rpartition(":")[0]
+    return is_loopback(host.strip("[]"))
 
 
 def is_loopback(host: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
@@ -14,6 +15,9 @@ from roel_service.store.principals import Principal
 
 # Health and reflection answer for themselves: nothing may hold them up.
 OUR_METHODS = ("/roel_service.v1.", "/google.longrunning.")
+
+# What is known of a certificate's owner, the names that a client was given for itself.
+CERTIFICATE_NAMES = ("x509_subject_alternative_name", "x509_common_name")
 
 REQUEST_ID_KEY = "x-request-id"
 MAX_REQUEST_ID_LENGTH = 64
@@ -30,7 +34,12 @@ class Call:
 
     Attributes:
         method: `/package.Service/Method`.
-        context: gRPC's.
+        context: gRPC's, to end the call; everything else is read from it before the call begins,
+            because gRPC crashes when it is asked about a call that its client has cancelled.
+        authorization: what the caller sent under that key.
+        certificate_names: for whom the caller's certificate was made.
+        peer: the caller's address, as gRPC writes it.
+        end_s: the caller's deadline on the loop's clock; None if it has none.
         request_id: names the call in logs and errors; the caller's, if it gave one.
         principal: who calls, once that is known.
         resource: what the request names.
@@ -39,7 +48,11 @@ class Call:
     """
 
     method: str
-    context: Any
+    context: Any = None
+    authorization: str | None = None
+    certificate_names: tuple[str, ...] = ()
+    peer: str = ""
+    end_s: float | None = None
     request_id: str = field(default_factory=lambda: uuid.uuid4().hex)
     principal: Principal | None = None
     resource: str = ""
@@ -117,7 +130,20 @@ class GuardInterceptor:
 
 def _call(method: str, context: Any) -> Call:
     metadata = dict(context.invocation_metadata() or ())
-    call = Call(method=method, context=context)
+    identity = context.auth_context()
+    remaining_s = context.time_remaining()
+    call = Call(
+        method=method,
+        context=context,
+        authorization=metadata.get("authorization"),
+        certificate_names=tuple(
+            name.decode(errors="replace")
+            for key in CERTIFICATE_NAMES
+            for name in identity.get(key, ())
+        ),
+        peer=context.peer(),
+        end_s=None if remaining_s is None else asyncio.get_running_loop().time() + remaining_s,
+    )
     given = metadata.get(REQUEST_ID_KEY, "")
     if given and len(given) <= MAX_REQUEST_ID_LENGTH and given.isprintable():
         call.request_id = given

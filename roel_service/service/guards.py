@@ -169,8 +169,10 @@ class Places:
             raise LimitError(call.method, expected, "one more", reason="QUEUE_FULL")
         waiting_count = max(0, self._taken_count + 1 - self._working_count)
         wait_s = self._mean_s * waiting_count / self._working_count
-        remaining_s = call.context.time_remaining()
-        if remaining_s is not None and remaining_s < wait_s:
+        if call.end_s is None:
+            return
+        remaining_s = call.end_s - asyncio.get_running_loop().time()
+        if remaining_s < wait_s:
             expected, found = (
                 f"a deadline beyond the wait of {wait_s:.3f} s",
                 f"{remaining_s:.3f} s",

@@ -128,7 +128,7 @@ class Observation:
             "code": code,
             "ms": round(1000 * spent_s, 3),
             "principal": call.principal.name if call.principal else "",
-            "peer": call.context.peer(),
+            "peer": call.peer,
             "resource": call.resource,
             "operation": call.operation,
             "received_bytes": call.received_bytes,

@@ -7,6 +7,7 @@ import logging
 import signal
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,29 +50,42 @@ IDENTITY_ONLY = 1
 DEFAULT_SETTINGS = Settings()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Addresses:
+    """Where a server answers.
+
+    Attributes:
+        calls: `HOST:PORT`, or `unix:PATH`.
+        admin: of metrics and probes, if it has them.
+    """
+
+    calls: str
+    admin: str | None = None
+
+
 async def serve(
     data: Path,
     listen: Listen,
     *,
-    on_ready: Callable[[str], None],
+    on_ready: Callable[[Addresses], None],
     settings: Settings = DEFAULT_SETTINGS,
 ) -> None:
     """Serve until SIGTERM or SIGINT, then drain; raises as `running`.
 
     Args:
-        on_ready: called once with the address when calls are answered.
+        on_ready: called once when calls are answered.
     """
     stop = _stop_at_signals()
-    async with running(data, listen, settings) as address:
-        on_ready(address)
+    async with running(data, listen, settings) as addresses:
+        on_ready(addresses)
         await stop.wait()
 
 
 @asynccontextmanager
 async def running(
     data: Path, listen: Listen, settings: Settings = DEFAULT_SETTINGS
-) -> AsyncIterator[str]:
-    """A server that drains at the end of the block; the address where it answers.
+) -> AsyncIterator[Addresses]:
+    """A server that drains at the end of the block; where it answers.
 
     Args:
         data: folder of all that the server keeps; created if it does not exist.
@@ -95,14 +109,14 @@ async def running(
         add_services(server, store, scheduler, settings)
         health_servicer = await _add_health(server)
         address = listen.bind(server, credentials)
+        admin = None
         if listen.admin is not None:
             probes = Probes(metrics=metrics.page, problems=partial(_problems, store, drain))
-            told = await resources.enter_async_context(admin_server(*listen.admin, probes))
-            logger.warning("metrics and probes on http://%s", told)
+            admin = await resources.enter_async_context(admin_server(*listen.admin, probes))
         await server.start()
         try:
             async with upkeep(store, settings.sweep_interval_s):
-                yield address
+                yield Addresses(calls=address, admin=admin)
         finally:
             logger.info("draining")
             await health_servicer.enter_graceful_shutdown()

@@ -42,7 +42,6 @@ class Settings:
         alias_count: most aliases of a map.
         calls_in_flight: calls of one method at a time.
         calls_waiting: calls of one method that may wait for their turn.
-        open_uploads: uploads at a time.
         drain_grace_s: how long calls other than uploads may go on after SIGTERM.
         build_entrypoint: `module:function` of a build, imported in the child alone.
     """
@@ -73,7 +72,6 @@ class Settings:
     alias_count: int = 64
     calls_in_flight: int = 32
     calls_waiting: int = 128
-    open_uploads: int = 64
     drain_grace_s: float = 2.0
     build_entrypoint: str = "roel_service.jobs.build:run_build"
 

@@ -37,8 +37,9 @@ class Server:
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment
             )
-        self.address = self.process.stdout.readline().strip()
-        assert self.address, self.log
+        told = self.process.stdout.readline().split()
+        assert told, self.log
+        self.address, self.admin = told
 
     @property
     def log(self):

@@ -13,10 +13,13 @@ def main():
     from pathlib import Path
 
     from roel_service.service.listen import Listen
+    from roel_service.service.logs import JsonFormatter
     from roel_service.service.server import serve
     from roel_service.service.settings import Settings
 
-    logging.basicConfig(level=logging.INFO)
+    handler = logging.StreamHandler()
+    handler.setFormatter(JsonFormatter())
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     folder, listen, settings = sys.argv[1:]
     defaults = {"build_entrypoint": "sample_builds:build", "retry_delay_s": 0.05}
     chosen = Settings(**{**defaults, **json.loads(settings)})
@@ -27,8 +30,8 @@ def main():
     asyncio.run(serving)
 
 
-def announce(address):
-    sys.stdout.write(f"{address}\n")
+def announce(addresses):
+    sys.stdout.write(f"{addresses.calls} {addresses.admin}\n")
     sys.stdout.flush()
 
 

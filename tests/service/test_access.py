@@ -256,7 +256,6 @@ def test_files_that_are_no_certificate_are_refused(files, tmp_path):
     [
         ("ipv4:127.0.0.1:5000", True),
         ("ipv6:%5B::1%5D:5000", True),
-        ("unix:", True),
         ("ipv4:192.0.2.1:5000", False),
         ("ipv6:%5B2001:db8::1%5D:5000", False),
     ],

@@ -18,14 +18,6 @@ WATCH = "/roel_service.v1.OperationService/WatchOperation"
 SETTINGS = Settings(calls_in_flight=1, calls_waiting=1, open_uploads=1)
 
 
-class Context:
-    def __init__(self, remaining_s=None):
-        self._remaining_s = remaining_s
-
-    def time_remaining(self):
-        return self._remaining_s
-
-
 class Work:
     """Calls at work behind a guard until they are told to end."""
 
@@ -38,7 +30,8 @@ class Work:
         return asyncio.create_task(self._run(method, remaining_s))
 
     async def _run(self, method, remaining_s):
-        async with self.guard(Call(method=method, context=Context(remaining_s))):
+        end_s = remaining_s and asyncio.get_running_loop().time() + remaining_s
+        async with self.guard(Call(method=method, end_s=end_s)):
             self.begun.append(method)
             await self.end.wait()
 
@@ -101,7 +94,7 @@ def test_a_place_is_free_again_after_a_failure():
         limits = CallLimits(SETTINGS)
         for _ in range(5):
             with pytest.raises(KeyError):
-                async with limits(Call(method=GET, context=Context())):
+                async with limits(Call(method=GET)):
                     raise KeyError
 
     asyncio.run(main())

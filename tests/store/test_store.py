@@ -61,3 +61,10 @@ def test_append_files_that_no_row_names_go_at_the_next_start(folder):
         assert not stray_recording.exists()
         assert store.event_streams.event_file(stream).exists()
         assert (folder / "recordings" / f"{opened.uid}.rec").exists()
+
+
+def test_a_store_whose_folder_went_tells_so(store, folder, tmp_path):
+    assert store.problems() == []
+    folder.rename(tmp_path / "elsewhere")
+    assert store.problems() == ["the data folder cannot be written"]
+    (tmp_path / "elsewhere").rename(folder)

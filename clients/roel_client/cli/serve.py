@@ -60,8 +60,4 @@ def serve(options: argparse.Namespace, staged: Staged) -> None:
         for name in ("host", "port", "tls_cert", "tls_key", "client_ca", "insecure", "admin")
     }
     with local.log_format(options.log_format):
-        local.serve(
-            Path(options.data),
-            listen,
-            on_ready=lambda address: print_text(to_json({"address": address})),
-        )
+        local.serve(Path(options.data), listen, lambda addresses: print_text(to_json(addresses)))
