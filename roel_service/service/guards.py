@@ -104,7 +104,8 @@ class CallLimits:
     """Bounds the calls at work; a few more may wait for their turn."""
 
     def __init__(self, settings: Settings) -> None:
-        self._uploads = Places(settings.open_uploads, 0)
+        # Twice as many as may go on: each may be taken over by a younger call.
+        self._uploads = Places(2 * settings.open_uploads, 0)
         self._methods: defaultdict[str, Places] = defaultdict(
             lambda: Places(settings.calls_in_flight, settings.calls_waiting)
         )

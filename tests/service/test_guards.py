@@ -79,12 +79,12 @@ def test_a_full_method_holds_up_no_other_and_no_watch():
 def test_all_uploads_share_one_limit():
     async def main():
         async with working(CallLimits(SETTINGS)) as work:
-            upload = work.start(APPEND)
+            uploads = [work.start(APPEND), work.start(POSES)]
             await settled()
             with pytest.raises(LimitError):
                 await work.start(POSES)
             work.end.set()
-            await upload
+            await asyncio.gather(*uploads)
 
     asyncio.run(main())
 
