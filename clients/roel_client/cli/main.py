@@ -56,6 +56,8 @@ def run(command_line: list[str]) -> int:
     """Parse the command line and run its command, in a child unless it handles signals itself."""
     options = parser().parse_args(command_line)
     command: Command = options.command
+    # gRPC's core writes to stderr by itself, beside the one line of a failure.
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     with logging_to_stderr(log_level(options), at_once=not command.in_child) as log:
         if command.in_child:
             return run_staged(command, options, log, command_line)
