@@ -4,10 +4,12 @@
 PYTHON ?= $(firstword $(foreach name,python3.11 python3.12 python3.13 python3,$(shell command -v $(name))))
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+BUF := $(CURDIR)/$(BIN)/buf
+BASELINE := proto/baseline.binpb
 WEIGHTS := .venv/.weights
 LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current no-large-files format proto docs bench accuracy limap serve
+.PHONY: demo learned test check stubs-are-current baseline no-large-files format proto docs bench accuracy limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -53,7 +55,12 @@ stubs-are-current: $(INSTALLED)  ## the committed stubs are what proto/ generate
 	diff -r -x __pycache__ build/generated/proto proto
 	diff -r -x __pycache__ build/generated/roel_service/v1 roel_service/v1
 	$(BIN)/python clients/generate.py --check
-	cp buf.yaml build/generated && cd build/generated && $(CURDIR)/$(BIN)/buf lint
+	cp buf.yaml build/generated
+	cd build/generated && $(BUF) lint && $(BUF) build -o now.binpb \
+	  && $(BUF) breaking now.binpb --against $(CURDIR)/$(BASELINE) --path roel_service/v1
+
+baseline: stubs-are-current  ## what later protocols must not break; written when a release is made
+	cd build/generated && $(BUF) build --exclude-source-info -o $(CURDIR)/$(BASELINE)
 
 # Without their dependencies: both demand a second OpenCV wheel, which would overwrite cv2 and remove
 # EDLines. What they need otherwise is in the extra `learned`.

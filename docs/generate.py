@@ -2,7 +2,7 @@
 
     python docs/generate.py [--root DIR]
 
-`errors.md` comes from `roel_service/reasons.py`; tests/house/test_docs.py says when it is stale.
+`errors.md` comes from `roel_service/reasons.py`, `api.md` from the comments of proto/; tests/house/test_docs.py says when it is stale.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from api_page import api_page
 from google.rpc import code_pb2
 
 from roel_service.errors import RoelError
@@ -57,6 +58,7 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=HERE, help="where to write")
     root = parser.parse_args().root
     (root / "errors.md").write_text(errors_page(), encoding="utf-8")
+    (root / "api.md").write_text(api_page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

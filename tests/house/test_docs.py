@@ -16,6 +16,6 @@ def fresh(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("page", ["errors.md"])
+@pytest.mark.parametrize("page", ["errors.md", "api.md"])
 def test_a_generated_page_is_current(fresh, page):
     assert (fresh / page).read_text() == (ROOT / "docs" / page).read_text()

@@ -40,7 +40,8 @@ def test_every_hook_runs_on_this_machine_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    "target", ["demo", "test", "check", "format", "proto", "bench", "accuracy", "serve"]
+    "target",
+    ["demo", "test", "check", "format", "proto", "docs", "baseline", "bench", "accuracy", "serve"],
 )
 def test_make_knows_the_target(target: str) -> None:
     assert run("make", "--dry-run", target).returncode == 0
