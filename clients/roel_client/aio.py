@@ -324,6 +324,11 @@ class AsyncOperation:
         operation.response.Unpack(version)
         return version
 
+    async def is_done(self) -> bool:
+        """Whether the operation has ended, well or not."""
+        request = operations_pb2.GetOperationRequest(name=self.name)
+        return bool((await self._connection.call(self._operations.GetOperation, request)).done)
+
     async def cancel(self) -> None:
         """End the build; returns when it has ended."""
         request = operations_pb2.CancelOperationRequest(name=self.name)

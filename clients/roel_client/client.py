@@ -317,6 +317,11 @@ class Operation:
         operation.response.Unpack(version)
         return version
 
+    def is_done(self) -> bool:
+        """Whether the operation has ended, well or not."""
+        request = operations_pb2.GetOperationRequest(name=self.name)
+        return bool((self._connection.call(self._operations.GetOperation, request)).done)
+
     def cancel(self) -> None:
         """End the build; returns when it has ended."""
         request = operations_pb2.CancelOperationRequest(name=self.name)

@@ -122,6 +122,8 @@ class Observation:
         metrics.seconds.observe(call.method, code, value=spent_s)
         metrics.received_bytes.add(call.method, amount=call.received_bytes)
         metrics.sent_bytes.add(call.method, amount=call.sent_bytes)
+        if not logger.isEnabledFor(logging.INFO):
+            return
         fields = {
             "request_id": call.request_id,
             "method": call.method,

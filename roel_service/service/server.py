@@ -149,9 +149,10 @@ def _guards(store: Store, settings: Settings, drain: Drain, metrics: Metrics) ->
         told_errors,
         Observation(metrics),
         drain,
+        # Before anything is looked up: refusing must cost less than answering.
+        CallLimits(settings),
         Auditing(store.audit),
         Access(store.principals),
-        CallLimits(settings),
     ]
 
 

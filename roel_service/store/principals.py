@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import secrets
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 from sqlalchemy import Row, delete, func, insert, select
@@ -44,12 +43,14 @@ class Principal:
 
     Attributes:
         name: shown in logs and in the audit; the name in a client's certificate.
+        token_sha256: digest of the token.
         create_time_us: microseconds since 1970.
         expire_time_us: from then on it is nobody; 0 for never.
     """
 
     name: str
     role: Role
+    token_sha256: str = field(default="", repr=False)
     create_time_us: int = 0
     expire_time_us: int = 0
 
@@ -109,34 +110,17 @@ class Principals:
             count = connection.execute(select(func.count()).select_from(PRINCIPAL)).scalar_one()
             return bool(count == 0)
 
-    def of_token(self, token: str) -> Principal | None:
-        """Who has this token."""
-        digest = token_sha256(token)
-        with self._database.read() as connection:
-            query = select(PRINCIPAL).where(PRINCIPAL.c.token_sha256 == digest)
-            return _current(connection.execute(query).first())
-
-    def of_names(self, names: Sequence[str]) -> Principal | None:
-        """Who has one of the names that a certificate carries."""
-        with self._database.read() as connection:
-            query = select(PRINCIPAL).where(PRINCIPAL.c.name.in_(names))
-            return _current(connection.execute(query.order_by(PRINCIPAL.c.name)).first())
-
 
 def token_sha256(token: str) -> str:
     """What is kept of a token."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
-def _current(row: Row[tuple[object, ...]] | None) -> Principal | None:
-    principal = None if row is None else _principal(row)
-    return principal if principal is not None and principal.is_current else None
-
-
 def _principal(row: Row[tuple[object, ...]]) -> Principal:
     return Principal(
         name=row.name,
         role=Role[row.role.upper()],
+        token_sha256=row.token_sha256,
         create_time_us=row.create_time_us,
         expire_time_us=row.expire_time_us,
     )

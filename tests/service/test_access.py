@@ -13,14 +13,14 @@ from roel_service.errors import (
     UnauthenticatedError,
     UnavailableError,
 )
-from roel_service.service.access import is_local_peer
+from roel_service.service.access import Directory, is_local_peer
 from roel_service.service.listen import Listen
 from roel_service.service.rules import RULES, UNLISTED, Rule, rule_of
-from roel_service.store.principals import Role
+from roel_service.store.principals import Principal, Role
 from roel_service.store.store import opened_principals
 
 from .certificates import Authority
-from .processes import CAMERA, Server, new_id
+from .processes import CAMERA, Server, new_id, wait_until
 
 ONCE = RetryPolicy(attempt_count=1)
 
@@ -134,15 +134,30 @@ def test_without_a_known_token_nobody_is_let_in(secure, tls, token):
     assert caught.value.reason == "UNAUTHENTICATED"
 
 
-def test_a_revoked_token_counts_no_longer(secure, tls):
+def test_tokens_are_made_and_revoked_while_the_server_runs(secure, tls):
     with opened_principals(secure.folder) as principals:
         token = principals.create("for-a-moment", Role.READER)
     with Client(secure.address, token=token, tls=tls, retry=ONCE) as client:
-        client.capabilities()
+
+        def is_known():
+            try:
+                client.capabilities()
+            except UnauthenticatedError:
+                return False
+            return True
+
+        wait_until(is_known)
         with opened_principals(secure.folder) as principals:
             principals.revoke("for-a-moment")
-        with pytest.raises(UnauthenticatedError):
-            client.capabilities()
+        wait_until(lambda: not is_known())
+
+
+def test_of_a_certificates_names_the_first_that_is_known_decides():
+    names = [Principal(name=name, role=Role.READER) for name in ("robot-1", "spiffe://fleet/2")]
+    gone = Principal(name="gone", role=Role.ADMIN, expire_time_us=1)
+    directory = Directory([*names, gone])
+    assert directory.of_names(["gone", "other", "spiffe://fleet/2", "robot-1"]) is names[1]
+    assert directory.of_names([]) is None
 
 
 def test_health_is_for_everybody(secure, tls):

@@ -1,0 +1,1 @@
+"""Load on a running server, measured from outside: a client and a server, each in its process."""
