@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roel_service.arrays import FloatArray, IntArray
+from roel_service.arrays import BoolArray, FloatArray, IntArray
 from roel_service.geometry.vectors import angle_between, dot, norm, unit
 
 # Cosine of the angle beyond which two segments count as orthogonal: neither faces the other.
@@ -248,3 +248,19 @@ def uncertainty_m(
         focal_px: focal length.
     """
     return np.asarray(sigma_px * segments_camera[..., 2].mean(axis=-1) / focal_px)
+
+
+def reaches_box(segments: FloatArray, lower: FloatArray, upper: FloatArray) -> BoolArray:
+    """(L,) whether some point of each segment lies in the closed box between two corners."""
+    start, direction = segments[..., 0, :], span(segments)
+    parallel = direction == 0
+    # Where a segment passes the planes of each pair of faces, in units of its length.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_lower = (lower - start) / direction
+        to_upper = (upper - start) / direction
+    between = (lower <= start) & (start <= upper)
+    enter = np.where(parallel, np.where(between, -np.inf, np.inf), np.fmin(to_lower, to_upper))
+    leave = np.where(parallel, np.where(between, np.inf, -np.inf), np.fmax(to_lower, to_upper))
+    first = np.maximum(enter.max(axis=-1), 0.0)
+    last = np.minimum(leave.min(axis=-1), 1.0)
+    return np.asarray(first <= last)

@@ -16,7 +16,7 @@ from roel_service.scene.lines import LineMap
 
 EXPORT_FORMATS = ("npz", "ply", "obj", "json", "csv", "dxf")
 
-_FIELDS = ("segments", "observation_count", "rms_residual", "sigma_m")
+FIELDS = ("segments", "observation_count", "rms_residual", "sigma_m")
 
 
 def export_map(line_map: LineMap, path: Path) -> None:
@@ -44,29 +44,44 @@ def read_exported_map(path: Path) -> LineMap:
         MapFileError: no NPZ archive with these arrays.
     """
     subject = str(path)
-    arrays = read_npz(path, _FIELDS, subject, MapFileError)
-    for name in _FIELDS[:3]:
+    arrays = read_npz(path, FIELDS, subject, MapFileError)
+    for name in FIELDS[:3]:
         if name not in arrays:
-            raise MapFileError(subject, f"arrays {', '.join(_FIELDS[:3])}", f"no {name}")
-    count = len(arrays["segments"]) if arrays["segments"].ndim else 0
-    sigma_m = arrays.get("sigma_m", np.zeros(count, np.float32))
+            raise MapFileError(subject, f"arrays {', '.join(FIELDS[:3])}", f"no {name}")
     try:
-        return LineMap(
-            segments=_array(arrays["segments"], np.float64, "segments"),
-            observation_count=_array(arrays["observation_count"], np.int32, "observation_count"),
-            rms_residual_px=_array(arrays["rms_residual"], np.float32, "rms_residual"),
-            sigma_m=_array(sigma_m, np.float32, "sigma_m"),
-        )
+        return line_map_from_fields(arrays)
     except ValueError as error:
         raise MapFileError(subject, "an exported line map", str(error)) from error
 
 
+def line_map_from_fields(fields: dict[str, Array]) -> LineMap:
+    """A map from arrays named as in `FIELDS`; all but the segments may be missing.
+
+    Raises:
+        KeyError, ValueError: no segments, or arrays that are no line map.
+    """
+    segments = fields["segments"]
+    count = len(segments) if segments.ndim else 0
+    unknown = np.zeros(count, np.int32)
+    return LineMap(
+        segments=_array(segments, np.float64, "segments"),
+        observation_count=_array(
+            fields.get("observation_count", unknown), np.int32, "observation_count"
+        ),
+        rms_residual_px=_array(fields.get("rms_residual", unknown), np.float32, "rms_residual"),
+        sigma_m=_array(fields.get("sigma_m", unknown), np.float32, "sigma_m"),
+    )
+
+
 def _array(values: Array, dtype: type[np.generic], name: str) -> Array:
     """As one dtype, provided that it holds every value."""
-    if values.dtype.kind not in ("iu" if dtype is np.int32 else "iuf"):
+    if values.dtype.kind not in "iuf":
         raise ValueError(f"{name} of {values.dtype}")
-    if dtype is np.int32 and values.size and not 0 <= values.min() <= values.max() < 2**31:
-        raise ValueError(f"{name} outside 0 to 2^31")
+    if dtype is np.int32 and values.size:
+        if values.dtype.kind == "f" and (values != np.rint(values)).any():
+            raise ValueError(f"{name} of fractions")
+        if not 0 <= values.min() <= values.max() < 2**31:
+            raise ValueError(f"{name} outside 0 to 2^31")
     with np.errstate(over="ignore"):
         return values.astype(dtype)
 
@@ -78,7 +93,7 @@ def _fields(line_map: LineMap) -> dict[str, Array]:
         line_map.rms_residual_px,
         line_map.sigma_m,
     )
-    return dict(zip(_FIELDS, columns, strict=True))
+    return dict(zip(FIELDS, columns, strict=True))
 
 
 def _records(line_map: LineMap) -> Iterator[tuple[list[list[float]], int, float, float]]:
@@ -92,12 +107,12 @@ def _json(line_map: LineMap) -> Iterator[str]:
     yield "["
     for index, record in enumerate(_records(line_map), 1):
         comma = "," if index < len(line_map) else ""
-        yield json.dumps(dict(zip(_FIELDS, record, strict=True))) + comma
+        yield json.dumps(dict(zip(FIELDS, record, strict=True))) + comma
     yield "]"
 
 
 def _csv(line_map: LineMap) -> Iterator[str]:
-    yield ",".join(["x0", "y0", "z0", "x1", "y1", "z1", *_FIELDS[1:]])
+    yield ",".join(["x0", "y0", "z0", "x1", "y1", "z1", *FIELDS[1:]])
     for (start, end), *rest in _records(line_map):
         yield ",".join(repr(value) for value in (*start, *end, *rest))
 

@@ -83,6 +83,29 @@ def read_ply(path: Path, error: type[InputError]) -> Ply:
     return Ply(vertices=vertices, normals=normals, faces=faces)
 
 
+def read_ply_edges(
+    path: Path, error: type[InputError], subject: str
+) -> tuple[FloatArray, dict[str, Array]]:
+    """Edges between vertices, as segments (E, 2, 3), and the other columns of the edges.
+
+    Raises:
+        InputError: of type `error`, as `read_ply`; no edges, or edges of other vertices.
+    """
+    with open_input(path) as file:
+        data = file.read()
+    try:
+        tables = _tables(data)
+        vertices = np.column_stack([tables["vertex"][axis] for axis in ("x", "y", "z")])
+        edge = tables["edge"]
+        ends = np.column_stack([edge["vertex1"], edge["vertex2"]]).astype(np.int64)
+    except (ValueError, KeyError) as damage:
+        expected = "a PLY file with vertices x y z and edges vertex1 vertex2"
+        raise error(subject, expected, f"{damage}") from damage
+    if ends.size and not 0 <= ends.min() <= ends.max() < len(vertices):
+        raise error(subject, f"edges of vertices 0 to {len(vertices) - 1}", "another index")
+    return vertices[ends].astype(np.float64), edge
+
+
 def _faces(face: _Table) -> IntArray | None:
     """(F, 3) triangles: polygons become fans about their first corner."""
     corners = face.get("vertex_indices", face.get("vertex_index"))

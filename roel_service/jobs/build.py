@@ -9,7 +9,7 @@ import resource
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 
 from roel_service import __version__
@@ -64,6 +64,7 @@ def run_build(parameters: BuildParameters, progress: ProgressCallback) -> BuiltV
         line_count=len(built.line_map),
         bounds_m=[*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()],
         report=built.report,
+        provenance=asdict(decode_map(built.rlm_bytes).provenance),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from roel_service.config.stages import Config
+from roel_service.jobs.imports import ImportParameters
 from roel_service.jobs.inputs import BuildParameters
 from roel_service.store.records import OperationRecord, TaskRecord
 from roel_service.store.store import Store
@@ -19,6 +20,18 @@ Prepare = Callable[[OperationRecord, TaskRecord], tuple[str, Any]]
 def build_parameters_to_bytes(config: Config) -> bytes:
     """What the row of a build's task says beside the rows that it works on."""
     return bytes(config_to_proto(config).SerializeToString(deterministic=True))
+
+
+def import_preparation(store: Store) -> Prepare:
+    """How an import is prepared: the version's row names the file."""
+
+    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, ImportParameters]:
+        version = store.maps.made_version(operation)
+        file = store.maps.imported_path(version)
+        parameters = ImportParameters(file=file, sha256=version.imported_file["sha256"])
+        return "roel_service.jobs.imports:run_import", parameters
+
+    return prepare
 
 
 def build_preparation(store: Store, entrypoint: str) -> Prepare:

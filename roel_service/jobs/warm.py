@@ -25,13 +25,15 @@ class WarmExecutor:
     def __init__(self, capacity: int, queued_count: int, preload: str = "") -> None:
         self.capacity = capacity
         self._preload = preload
+        self._child_count = 0
         self._admitted_count = 0
         self._max_admitted_count = capacity + queued_count
         self._idle: asyncio.LifoQueue[_WarmChild] = asyncio.LifoQueue()
 
     def start(self) -> None:
-        """Start the children; they import what they need while nobody waits."""
-        for _ in range(self.capacity):
+        """Start the children that the first calls would start otherwise, while nobody waits."""
+        while self._child_count < self.capacity:
+            self._child_count += 1
             self._idle.put_nowait(_WarmChild(self._preload))
 
     async def run(self, spec: TaskSpec, on_news: OnNews) -> Any:
@@ -54,6 +56,9 @@ class WarmExecutor:
             await self._idle.get_nowait().end()
 
     async def _ready_child(self) -> _WarmChild:
+        if self._idle.empty() and self._child_count < self.capacity:
+            self._child_count += 1
+            return _WarmChild(self._preload)
         child = await self._idle.get()
         # It may have been killed while it waited.
         return child if child.is_reusable else _WarmChild(self._preload)

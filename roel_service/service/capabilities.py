@@ -8,6 +8,7 @@ from typing import Any
 from roel_service import __version__
 from roel_service.config.presets import PRESETS
 from roel_service.config.stages import DETECTORS, MATCHERS
+from roel_service.io.foreign_maps import FOREIGN_FORMATS
 from roel_service.io.maps import EXPORT_FORMATS
 from roel_service.scene.results import MAPPING_STAGES
 from roel_service.service.methods import is_implemented, method_name
@@ -40,6 +41,7 @@ class CapabilitiesServicer:
             chunk_versions=[chunks.CHUNK_VERSION],
             chunk_encodings=["columnar-zstd"],
             map_file_version=f"{rlm.FORMAT_MAJOR}.{rlm.FORMAT_MINOR}",
+            import_formats=["rlm", *FOREIGN_FORMATS],
             export_formats=["rlm", *EXPORT_FORMATS],
             detectors=DETECTORS,
             matchers=MATCHERS,

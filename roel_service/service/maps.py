@@ -1,28 +1,34 @@
-"""MapService: maps are built, looked up and fetched."""
+"""MapService: maps are named, made, looked up and fetched."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
 from google.longrunning import operations_pb2
 
 from roel_service.config.stages import Config
-from roel_service.errors import ConfigError
+from roel_service.errors import ConfigError, InputError
 from roel_service.jobs.preparation import build_parameters_to_bytes
-from roel_service.jobs.scheduler import Scheduler
+from roel_service.jobs.scheduler import Begin, Scheduler
+from roel_service.service.exports import Exporter
 from roel_service.service.labels import checked_display_name, checked_labels, updated_fields
+from roel_service.service.line_streams import conditions_from_proto, line_messages
+from roel_service.service.operations import encoded_operation
 from roel_service.service.paging import page_of, page_request
-from roel_service.service.records import map_to_proto, map_version_to_proto, operation_to_proto
-from roel_service.service.requests import request_id
+from roel_service.service.records import map_to_proto, map_version_to_proto
+from roel_service.service.requests import content_sha256, request_id
 from roel_service.service.settings import Settings
+from roel_service.store.builds import ImportedBlob
 from roel_service.store.records import MapVersionRecord
+from roel_service.store.requests import RequestId
 from roel_service.store.store import Store
 from roel_service.v1 import maps_pb2
 from roel_service.wire import names
 from roel_service.wire.configs import config_from_proto
+from roel_service.wire.rlm import MapBlocks
 
 DEFAULT_PRESET = "default"
 
@@ -30,9 +36,12 @@ DEFAULT_PRESET = "default"
 class MapServicer:
     """Decodes requests, calls store or scheduler, encodes answers."""
 
-    def __init__(self, store: Store, scheduler: Scheduler, settings: Settings) -> None:
+    def __init__(
+        self, store: Store, scheduler: Scheduler, exporter: Exporter, settings: Settings
+    ) -> None:
         self._store = store
         self._scheduler = scheduler
+        self._exporter = exporter
         self._settings = settings
 
     async def CreateMap(self, request: maps_pb2.CreateMapRequest, context: Any) -> maps_pb2.Map:
@@ -90,10 +99,30 @@ class MapServicer:
         map_id = names.map_id(request.parent)
         stream_id = names.event_stream_id(request.event_stream)
         config = _requested_config(request)
-        parameters = build_parameters_to_bytes(config)
-        begin = partial(self._store.builds.begin, map_id, stream_id, parameters=parameters)
-        record = await self._scheduler.submit(begin)
-        return operation_to_proto(record, None)
+        if request.validate_only:
+            version = await asyncio.to_thread(self._store.builds.check, map_id, stream_id)
+            return _validated(map_id, version, request.event_stream)
+        identity = request_id(request)
+        begin = partial(
+            self._store.builds.begin,
+            map_id,
+            stream_id,
+            content_sha256(request),
+            parameters=build_parameters_to_bytes(config),
+            request=identity,
+        )
+        return await self._submitted(begin, identity)
+
+    async def ImportMap(
+        self, request: maps_pb2.ImportMapRequest, context: Any
+    ) -> operations_pb2.Operation:
+        map_id = names.map_id(request.parent)
+        file = await self._imported(request)
+        identity = request_id(request)
+        begin = partial(
+            self._store.builds.begin_import, map_id, file, content_sha256(request), identity
+        )
+        return await self._submitted(begin, identity)
 
     async def GetMapVersion(
         self, request: maps_pb2.GetMapVersionRequest, context: Any
@@ -140,19 +169,96 @@ class MapServicer:
         self, request: maps_pb2.ExportMapRequest, context: Any
     ) -> AsyncIterator[maps_pb2.ExportMapResponse]:
         record = await self._version(request.name)
-        data = await asyncio.to_thread(self._store.maps.map_file, record)
-        yield maps_pb2.ExportMapResponse(
-            map_version=names.map_version_name(record.map_id, record.version), size_bytes=len(data)
+        async with self._exporter.file(record, request.format) as path:
+            size_bytes = path.stat().st_size
+            yield maps_pb2.ExportMapResponse(map_version=_name(record), size_bytes=size_bytes)
+            with path.open("rb") as file:
+                while data := await asyncio.to_thread(
+                    file.read, self._settings.download_part_bytes
+                ):
+                    yield maps_pb2.ExportMapResponse(data=data)
+
+    async def GetLines(
+        self, request: maps_pb2.GetLinesRequest, context: Any
+    ) -> AsyncIterator[maps_pb2.GetLinesResponse]:
+        conditions = conditions_from_proto(request)
+        record = await self._version(request.name)
+        blocks = await asyncio.to_thread(self._blocks, record)
+        max_line_count = self._settings.lines_per_message
+        messages = line_messages(blocks, conditions, _name(record), max_line_count)
+        # Each message in a thread: the front goes on meanwhile.
+        while (message := await asyncio.to_thread(next, messages, None)) is not None:
+            yield message
+
+    async def SyncBlocks(
+        self, request: maps_pb2.SyncBlocksRequest, context: Any
+    ) -> maps_pb2.SyncBlocksResponse:
+        record = await self._version(request.name)
+        blocks = await asyncio.to_thread(self._blocks, record)
+        digests = [blocks.sha256(block) for block in range(blocks.count)]
+        held = set(request.held_block_sha256)
+        missing = [block for block, digest in enumerate(digests) if digest not in held]
+        return maps_pb2.SyncBlocksResponse(
+            map_version=_name(record),
+            head=blocks.head,
+            block_sha256=digests,
+            blocks=_fitting(blocks, missing, self._settings.message_out_bytes // 2),
+            tail=blocks.tail,
         )
-        size = self._settings.download_part_bytes
-        for start in range(0, len(data), size):
-            yield maps_pb2.ExportMapResponse(data=data[start : start + size])
+
+    async def _submitted(
+        self, begin: Begin, identity: RequestId | None
+    ) -> operations_pb2.Operation:
+        """The operation that was begun, now or by an earlier call with the same request id."""
+        # A full queue does not keep anybody from asking again.
+        record = await asyncio.to_thread(self._store.operations.begun, identity)
+        if record is None:
+            record = await self._scheduler.submit(begin)
+        return await encoded_operation(self._store, record)
+
+    async def _imported(self, request: maps_pb2.ImportMapRequest) -> ImportedBlob:
+        """The file of an import, in the store."""
+        source = request.WhichOneof("source")
+        if source is None:
+            raise InputError("source", "data or blob", "none")
+        if source == "blob":
+            sha256 = names.checked_sha256(request.blob.sha256)
+            return ImportedBlob(sha256=sha256, size_bytes=request.blob.size_bytes)
+        return await asyncio.to_thread(self._store.builds.put_import, request.data)
 
     async def _version(self, name: str) -> MapVersionRecord:
         return await asyncio.to_thread(self._store.maps.version, *names.map_version_id(name))
 
+    def _blocks(self, record: MapVersionRecord) -> MapBlocks:
+        return MapBlocks(self._store.maps.map_file(record), subject=_name(record))
+
     def _version_page(self, map_id: str, after: str, limit: int) -> Sequence[MapVersionRecord]:
         return self._store.maps.version_page(map_id, int(after or 0), limit)
+
+
+def _name(record: MapVersionRecord) -> str:
+    return names.map_version_name(record.map_id, record.version)
+
+
+def _fitting(blocks: MapBlocks, wanted: Iterable[int], max_bytes: int) -> Iterator[bytes]:
+    """The first of the wanted blocks, as many as fit; at least one."""
+    sent_bytes = 0
+    for block in wanted:
+        data = blocks.stored(block)
+        sent_bytes += len(data)
+        if sent_bytes > max(max_bytes, len(data)):
+            return
+        yield data
+
+
+def _validated(map_id: str, version: int, event_stream: str) -> operations_pb2.Operation:
+    """What a build would begin."""
+    operation = operations_pb2.Operation(done=True)
+    message = maps_pb2.MapVersion(
+        name=names.map_version_name(map_id, version), event_stream=event_stream
+    )
+    operation.response.Pack(message)
+    return operation
 
 
 def _requested_config(request: maps_pb2.BuildMapRequest) -> Config:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator
 from typing import Any
 
 from google.longrunning import operations_pb2
 from google.protobuf.empty_pb2 import Empty
 
+from roel_service.errors import NotFoundError
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import (
@@ -100,13 +102,21 @@ class OperationServicer:
         return await asyncio.to_thread(self._store.operations.get, operation_id)
 
     async def _encoded(self, record: OperationRecord) -> operations_pb2.Operation:
-        answer = None
-        if record.state is OperationState.SUCCEEDED:
-            answer = await asyncio.to_thread(self._answer, record)
-        return operation_to_proto(record, answer)
+        return await encoded_operation(self._store, record)
 
-    def _answer(self, record: OperationRecord) -> Any:
-        """What the method answers: the resource that it made, as it is now."""
+
+async def encoded_operation(store: Store, record: OperationRecord) -> operations_pb2.Operation:
+    """An operation as a message; one that SUCCEEDED answers with the resource that it made."""
+    answer = None
+    if record.state is OperationState.SUCCEEDED:
+        answer = await asyncio.to_thread(_answer, store, record)
+    return operation_to_proto(record, answer)
+
+
+def _answer(store: Store, record: OperationRecord) -> Any:
+    """The resource as it is now; None when it is forgotten."""
+    with contextlib.suppress(NotFoundError):
         if record.method is OperationMethod.IMPORT_EVENT_STREAM:
-            return event_stream_to_proto(self._store.event_streams.get(record.event_stream_id))
-        return map_version_to_proto(self._store.maps.version(record.map_id, record.version))
+            return event_stream_to_proto(store.event_streams.get(record.event_stream_id))
+        return map_version_to_proto(store.maps.made_version(record))
+    return None

@@ -17,12 +17,14 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from roel_service.jobs.executors import ProcessExecutor
-from roel_service.jobs.preparation import build_preparation
+from roel_service.jobs.preparation import build_preparation, import_preparation
 from roel_service.jobs.scheduler import Policy, Scheduler
 from roel_service.jobs.upkeep import upkeep
+from roel_service.jobs.warm import WarmExecutor
 from roel_service.service.access import Access
 from roel_service.service.admin import Probes, admin_server
 from roel_service.service.calls import Guard, GuardInterceptor
+from roel_service.service.exports import Exporter
 from roel_service.service.guards import CallLimits, Drain, told_errors
 from roel_service.service.listen import Listen
 from roel_service.service.observe import Auditing, Metrics, Observation
@@ -106,7 +108,8 @@ async def running(
             options=_options(settings),
             compression=None,
         )
-        add_services(server, store, scheduler, settings)
+        executor = WarmExecutor(settings.concurrent_exports, settings.queued_exports)
+        add_services(server, store, scheduler, Exporter(store, executor, settings), settings)
         health_servicer = await _add_health(server)
         address = listen.bind(server, credentials)
         admin = None
@@ -124,6 +127,7 @@ async def running(
             await scheduler.drain()
             await drain.finish(settings.drain_grace_s)
             await server.stop(STOP_GRACE_S)
+            await executor.close()
 
 
 def _scheduler(store: Store, settings: Settings) -> Scheduler:
@@ -132,7 +136,10 @@ def _scheduler(store: Store, settings: Settings) -> Scheduler:
         store.operations,
         store.tasks,
         ProcessExecutor(settings.concurrent_builds),
-        {OperationMethod.BUILD_MAP: build},
+        {
+            OperationMethod.BUILD_MAP: build,
+            OperationMethod.IMPORT_MAP: import_preparation(store),
+        },
         Policy(
             unfinished_count=settings.concurrent_builds + settings.queued_builds,
             memory_bytes=settings.task_memory_bytes,

@@ -10,6 +10,7 @@ from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.blobs import BlobServicer
 from roel_service.service.capabilities import CapabilitiesServicer
 from roel_service.service.event_streams import EventStreamServicer
+from roel_service.service.exports import Exporter
 from roel_service.service.maps import MapServicer
 from roel_service.service.methods import complete
 from roel_service.service.operations import OperationServicer
@@ -68,14 +69,16 @@ _DESCRIPTORS = {
 SERVICES = tuple(descriptor.full_name for descriptor in _DESCRIPTORS.values())
 
 
-def add_services(server: Any, store: Store, scheduler: Scheduler, settings: Settings) -> None:
+def add_services(
+    server: Any, store: Store, scheduler: Scheduler, exporter: Exporter, settings: Settings
+) -> None:
     """Add every service of the protocol; methods that nobody wrote yet refuse."""
     operations = OperationServicer(store, scheduler)
     uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
         "EventStreamService": EventStreamServicer(store.event_streams, uploads, settings),
         "BlobService": BlobServicer(store.uploads, uploads, settings),
-        "MapService": MapServicer(store, scheduler, settings),
+        "MapService": MapServicer(store, scheduler, exporter, settings),
         "OperationService": operations,
         "Operations": operations,
     }

@@ -42,6 +42,8 @@ class Settings:
         alias_count: most aliases of a map.
         calls_in_flight: calls of one method at a time.
         calls_waiting: calls of one method that may wait for their turn.
+        export_time_s: how long a version may take to be written in another format.
+        concurrent_exports, queued_exports: such versions at a time, and those that may wait.
         drain_grace_s: how long calls other than uploads may go on after SIGTERM.
         build_entrypoint: `module:function` of a build, imported in the child alone.
     """
@@ -72,6 +74,9 @@ class Settings:
     alias_count: int = 64
     calls_in_flight: int = 32
     calls_waiting: int = 128
+    export_time_s: float = 300.0
+    concurrent_exports: int = 1
+    queued_exports: int = 8
     drain_grace_s: float = 2.0
     build_entrypoint: str = "roel_service.jobs.build:run_build"
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import dataclasses
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import Connection, insert, update
 
-from roel_service.errors import StateError
+from roel_service.errors import NotFoundError, StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.event_streams import get_finalized
 from roel_service.store.map_rows import get_map
-from roel_service.store.operations import queued_operation
+from roel_service.store.operations import operation_memory, queued_operation
 from roel_service.store.records import (
     MapVersionRecord,
     OperationMethod,
@@ -21,6 +22,7 @@ from roel_service.store.records import (
     row_from_record,
     stored,
 )
+from roel_service.store.requests import RequestId, once
 from roel_service.store.schema import MAP, MAP_VERSION, OPERATION
 from roel_service.store.tasks import insert_task
 
@@ -32,34 +34,56 @@ class BuiltVersion:
     Attributes:
         rlm_bytes: the map file.
         bounds_m: lower corner, then upper corner, 6 numbers.
-        report: as the command line prints it.
+        report: as the command line prints it; empty for an import.
+        provenance: what the map was made of.
+        imported_file: what it was read from; empty for a build.
     """
 
     rlm_bytes: bytes
     line_count: int
     bounds_m: list[float]
     report: dict[str, Any]
+    provenance: dict[str, str] = field(default_factory=dict)
+    imported_file: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedBlob:
+    """A file of lines in the store."""
+
+    sha256: str
+    size_bytes: int
 
 
 class Builds:
     """Begins the operations that make a map version."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, blobs: BlobStore) -> None:
         self._database = database
+        self._blobs = blobs
 
     def begin(
-        self, map_id: str, stream_id: str, request_sha256: str = "", *, parameters: bytes = b""
+        self,
+        map_id: str,
+        stream_id: str,
+        request_sha256: str = "",
+        *,
+        parameters: bytes = b"",
+        request: RequestId | None = None,
     ) -> OperationRecord:
         """A new version, the operation that builds it, and its task with these parameters.
 
+        Args:
+            request_sha256: digest of what was asked for.
+            request: what the caller named the request; the same one has the same operation.
+
         Raises:
             NotFoundError: no such map or recording.
-            StateError: STREAM_NOT_FINALIZED, or NO_POSES.
+            StateError: MAP_DELETED, STREAM_NOT_FINALIZED, or NO_POSES.
         """
-        with self._database.write() as connection:
-            version = get_map(connection, map_id).version_count + 1
-            if get_finalized(connection, stream_id).pose_count == 0:
-                raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
+
+        def act(connection: Connection) -> OperationRecord:
+            version = _next_version(connection, map_id, stream_id)
             operation = queued_operation(
                 OperationMethod.BUILD_MAP,
                 request_sha256=request_sha256,
@@ -69,7 +93,52 @@ class Builds:
             )
             insert_version(connection, operation)
             insert_task(connection, operation.id, parameters, [])
-        return operation
+            return operation
+
+        with self._database.write() as connection:
+            memory = operation_memory(connection)
+            return once(connection, request, memory, lambda: act(connection))
+
+    def check(self, map_id: str, stream_id: str) -> int:
+        """Number of the version that a build would begin now; raises as `begin`."""
+        with self._database.read() as connection:
+            return _next_version(connection, map_id, stream_id)
+
+    def begin_import(
+        self,
+        map_id: str,
+        file: ImportedBlob,
+        request_sha256: str = "",
+        request: RequestId | None = None,
+    ) -> OperationRecord:
+        """A new version, the operation that fills it from a stored file, and its task.
+
+        Raises:
+            NotFoundError: no such map or blob.
+            StateError: MAP_DELETED.
+        """
+
+        def act(connection: Connection) -> OperationRecord:
+            version = get_map(connection, map_id).version_count + 1
+            if not self._blobs.path(file.sha256).exists():
+                raise NotFoundError("blob", "an uploaded one", file.sha256)
+            operation = queued_operation(
+                OperationMethod.IMPORT_MAP,
+                request_sha256=request_sha256,
+                map_id=map_id,
+                version=version,
+            )
+            insert_version(connection, operation, dataclasses.asdict(file))
+            insert_task(connection, operation.id, b"", [file.sha256])
+            return operation
+
+        with self._database.write() as connection:
+            memory = operation_memory(connection)
+            return once(connection, request, memory, lambda: act(connection))
+
+    def put_import(self, data: bytes) -> ImportedBlob:
+        """Store a file that came with a request."""
+        return ImportedBlob(sha256=self._blobs.put(data), size_bytes=len(data))
 
 
 class VersionCompletion:
@@ -110,16 +179,28 @@ class VersionCompletion:
             "line_count": built.line_count,
             "bounds_m": built.bounds_m,
             "report": built.report,
+            "provenance": built.provenance,
+            "imported_file": built.imported_file,
         }
         _change_version(connection, operation, changes)
 
 
-def insert_version(connection: Connection, operation: OperationRecord) -> None:
+def insert_version(
+    connection: Connection, operation: OperationRecord, imported_file: dict[str, Any] | None = None
+) -> None:
     """An operation that makes a version, with that version, the newest of its map."""
     counted = update(MAP).where(MAP.c.id == operation.map_id)
     connection.execute(counted.values(version_count=operation.version))
-    connection.execute(insert(MAP_VERSION), row_from_record(_creating(operation)))
+    version = dataclasses.replace(_creating(operation), imported_file=imported_file or {})
+    connection.execute(insert(MAP_VERSION), row_from_record(version))
     connection.execute(insert(OPERATION), row_from_record(operation))
+
+
+def _next_version(connection: Connection, map_id: str, stream_id: str) -> int:
+    version = get_map(connection, map_id).version_count + 1
+    if get_finalized(connection, stream_id).pose_count == 0:
+        raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
+    return version
 
 
 def _change_version(

@@ -7,6 +7,7 @@ import json
 import uuid
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection, delete, select
@@ -34,6 +35,7 @@ from roel_service.store.records import (
     USABLE,
     MapRecord,
     MapVersionRecord,
+    OperationRecord,
     VersionState,
     map_version_from_row,
     now_us,
@@ -204,6 +206,12 @@ class Maps:
         with self._database.read() as connection:
             return get_version(connection, get_map(connection, map_id), label)
 
+    def made_version(self, operation: OperationRecord) -> MapVersionRecord:
+        """What an operation makes or made, also of a deleted map; raises `NotFoundError`."""
+        with self._database.read() as connection:
+            record = find_map(connection, operation.map_id)
+            return get_version(connection, record, operation.version)
+
     def version_page(self, map_id: str, after_version: int, limit: int) -> list[MapVersionRecord]:
         """Versions above `after_version`, oldest first; raises as `version`."""
         query = select(MAP_VERSION).where(
@@ -246,6 +254,15 @@ class Maps:
         """The map file of a usable version; raises `StateError` MAP_NOT_ACTIVE."""
         check_state(record, USABLE)
         return self._blobs.read(record.sha256)
+
+    def map_path(self, record: MapVersionRecord) -> Path:
+        """Where the map file of a usable version lies; raises as `map_file`."""
+        check_state(record, USABLE)
+        return self._blobs.path(record.sha256)
+
+    def imported_path(self, record: MapVersionRecord) -> Path:
+        """Where the file lies that a version is being made from."""
+        return self._blobs.path(record.imported_file["sha256"])
 
     def forget_deleted(self) -> None:
         """Forget maps and versions whose time has come; their blobs are left to the sweep."""

@@ -39,6 +39,7 @@ from roel_service.store.records import (
     operation_from_row,
     stored,
 )
+from roel_service.store.requests import Memory, RequestId, recall
 from roel_service.store.retention import DAY_US, OPERATION_RETENTION_DAYS
 from roel_service.store.schema import OPERATION, TASK
 from roel_service.store.tasks import check_lease, end_task, end_tasks_of, requeue_task
@@ -141,6 +142,11 @@ class Operations:
         with self._database.read() as connection:
             return get_operation(connection, operation_id)
 
+    def begun(self, request: RequestId | None) -> OperationRecord | None:
+        """The operation that an earlier call with this request id began; raises as `recall`."""
+        with self._database.read() as connection:
+            return recall(connection, request, operation_memory(connection))
+
     def page(self, after_id: str, limit: int) -> list[OperationRecord]:
         """Operations with an id above `after_id`, in the order of ids."""
         query = select(OPERATION).where(OPERATION.c.id > after_id)
@@ -223,6 +229,11 @@ def queued_operation(
         end_time_us=0,
         expire_time_us=0,
     )
+
+
+def operation_memory(connection: Connection) -> Memory[OperationRecord]:
+    """Remembers an operation by its id: whoever asks again sees how far it is."""
+    return Memory(lambda record: record.id, lambda key: get_operation(connection, key))
 
 
 def get_operation(connection: Connection, operation_id: str) -> OperationRecord:

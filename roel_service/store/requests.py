@@ -55,12 +55,31 @@ def once(
     if request is None:
         return act()
     delete_expired_requests(connection)
-    query = select(REQUEST.c.content_sha256, REQUEST.c.result).where(REQUEST.c.id == request.id)
-    known = connection.execute(query).one_or_none()
+    known = recall(connection, request, memory)
+    if known is not None:
+        return known
+    result = act()
+    connection.execute(insert(REQUEST), _row(request, memory.to_text(result)))
+    return result
+
+
+def recall(
+    connection: Connection, request: RequestId | None, memory: Memory[Result]
+) -> Result | None:
+    """The result of the first call with the same request id; None if there was none.
+
+    Raises:
+        InputError: REQUEST_ID_REUSED, the first call had another content.
+    """
+    if request is None:
+        return None
+    known = connection.execute(
+        select(REQUEST.c.content_sha256, REQUEST.c.result).where(
+            REQUEST.c.id == request.id, REQUEST.c.expire_time_us > now_us()
+        )
+    ).one_or_none()
     if known is None:
-        result = act()
-        connection.execute(insert(REQUEST), _row(request, memory.to_text(result)))
-        return result
+        return None
     if known.content_sha256 != request.content_sha256:
         expected = "an id of this request alone"
         raise InputError("request_id", expected, "one of another", reason="REQUEST_ID_REUSED")

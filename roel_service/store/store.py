@@ -1,12 +1,14 @@
-"""One data folder: `rows.sqlite`, `blobs/sha256`, `recordings`, `uploads`, and the lock on all of them."""
+"""One data folder: rows, blobs, recordings, uploads, scratch, and the lock on all of them."""
 
 from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -55,17 +57,20 @@ class Store:
             self._recordings = Recordings(folder / "recordings")
             self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
             self.maps = Maps(self._database, self._blobs)
-            self.builds = Builds(self._database)
+            self.builds = Builds(self._database, self._blobs)
             self.principals = Principals(self._database)
             self.audit = Audit(self._database, AUDIT_ROW_COUNT)
+            versions = VersionCompletion(self._blobs)
             self.operations = Operations(
-                self._database, {OperationMethod.BUILD_MAP: VersionCompletion(self._blobs)}
+                self._database,
+                {OperationMethod.BUILD_MAP: versions, OperationMethod.IMPORT_MAP: versions},
             )
             self.tasks = Tasks(self._database)
             self.uploads = Uploads(self._database, self._blobs, folder / "uploads")
             # What a crash left of uploads; nothing is being written yet.
             self.event_streams.recover()
             self.uploads.recover()
+            self._scratch = _emptied(folder / "scratch")
             self._resources = resources.pop_all()
 
     def __enter__(self) -> Store:
@@ -93,6 +98,12 @@ class Store:
         if not os.access(self._folder, os.W_OK | os.X_OK):
             problems.append("the data folder cannot be written")
         return problems
+
+    @contextmanager
+    def scratch(self) -> Iterator[Path]:
+        """A folder for files that only a call needs; gone with the block."""
+        with TemporaryDirectory(dir=self._scratch) as name:
+            yield Path(name)
 
 
 @contextmanager
@@ -122,6 +133,13 @@ def _check_folder(folder: Path) -> None:
         raise InputError(str(folder), "a data folder", f"{error.strerror}") from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(str(folder), "a data folder that can be written", "no permission")
+
+
+def _emptied(folder: Path) -> Path:
+    """An empty folder; what a server that died had left there is gone."""
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    return folder
 
 
 @contextmanager

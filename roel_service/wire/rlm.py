@@ -12,6 +12,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
@@ -38,6 +39,7 @@ from roel_service.wire.line_columns import (
 from roel_service.wire.nouns import bounds_from_proto, bounds_to_proto
 from roel_service.wire.provenance import Provenance
 
+RLM_MAGIC = b"RLM1"
 FORMAT_MAJOR = 1
 FORMAT_MINOR = 0
 MAX_LINE_COUNT = 10**7
@@ -125,7 +127,9 @@ def encode_map(line_map: LineMap, provenance: Provenance, *, frame_id: str = "wo
         column_ids=list(COLUMN_BYTES),
         provenance=map_file_pb2.MapProvenance(**asdict(provenance)),
     ).SerializeToString(deterministic=True)
-    preamble = _PREAMBLE.pack(b"RLM1", FORMAT_MAJOR, FORMAT_MINOR, len(header), zlib.crc32(header))
+    preamble = _PREAMBLE.pack(
+        RLM_MAGIC, FORMAT_MAJOR, FORMAT_MINOR, len(header), zlib.crc32(header)
+    )
     data = bytearray(preamble + header)
     entries = []
     for first in range(0, len(lines), BLOCK_LINE_COUNT):
@@ -150,8 +154,74 @@ def decode_map(data: bytes, *, subject: str = "map file") -> MapFile:
     Raises:
         MapFileError: any byte changed, missing or added, or a format of another major version.
     """
+    with _naming(subject):
+        opened = _open(data)
+        header = opened.header
+        lower, upper = bounds_from_proto(header.bounds)
+        blocks = [opened.rounded_lines(entry) for entry in opened.entries]
+        return MapFile(
+            line_map=line_map_from_rounded(_joined(blocks), opened.grid),
+            provenance=_provenance(header.provenance),
+            frame_id=header.frame_id,
+            bounds_min_m=lower,
+            bounds_max_m=upper,
+            dropped_line_count=header.dropped_line_count,
+            format_version=opened.format_version,
+            byte_count=len(data),
+            digest=file_digest(data),
+        )
+
+
+class MapBlocks:
+    """A container whose blocks are decoded when somebody asks for them.
+
+    Args:
+        data: the whole file; its checksum is verified at once.
+        subject: its name, for errors.
+
+    Attributes:
+        count: blocks.
+        head, tail: the bytes before and behind all blocks.
+
+    Raises:
+        MapFileError: as `decode_map`, here or when the damaged block is decoded.
+    """
+
+    def __init__(self, data: bytes, *, subject: str = "map file") -> None:
+        self._subject = subject
+        with _naming(subject):
+            self._opened = _open(data)
+        self.count = len(self._opened.entries)
+        index_offset = _TRAILER.unpack_from(data, len(data) - _SHA256_BYTES - _TRAILER.size)[0]
+        first = self._opened.entries[0].offset if self.count else index_offset
+        self.head = data[:first]
+        self.tail = data[index_offset:]
+
+    def sha256(self, block: int) -> bytes:
+        """Digest of a block's bytes."""
+        return self._opened.entries[block].sha256
+
+    def stored(self, block: int) -> bytes:
+        """The bytes of a block."""
+        return self._opened.stored(self._opened.entries[block])
+
+    def lines(self, block: int) -> LineMap:
+        """The lines of a block."""
+        with _naming(self._subject):
+            rounded = self._opened.rounded_lines(self._opened.entries[block])
+        return line_map_from_rounded(rounded, self._opened.grid)
+
+    def bounds_m(self, block: int) -> tuple[FloatArray, FloatArray]:
+        """(3,) corners of the box around a block's lines."""
+        lower, upper = np.array(self._opened.entries[block].box).reshape(2, 3)
+        return self._opened.grid.points(lower), self._opened.grid.points(upper)
+
+
+@contextmanager
+def _naming(subject: str) -> Iterator[None]:
+    """Says which file is damaged."""
     try:
-        return _decode(data)
+        yield
     except DamageError as damage:
         raise MapFileError(subject, "an undamaged line map", str(damage)) from damage
 
@@ -161,30 +231,44 @@ def _require(condition: bool, otherwise: str) -> None:
         raise DamageError(otherwise)
 
 
-def _decode(data: bytes) -> MapFile:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Opened:
+    """A container with its checksum and index verified.
+
+    Attributes:
+        content: all bytes but the checksum.
+    """
+
+    content: bytes
+    header: map_file_pb2.MapHeader
+    grid: Grid
+    entries: list[_IndexEntry]
+    format_version: tuple[int, int]
+
+    def stored(self, entry: _IndexEntry) -> bytes:
+        return self.content[entry.offset : entry.offset + entry.length]
+
+    def rounded_lines(self, entry: _IndexEntry) -> RoundedLines:
+        return _decode_block(self.stored(entry), entry, tuple(self.header.column_ids))
+
+
+def _open(data: bytes) -> _Opened:
     smallest = _PREAMBLE.size + _INDEX.size + _TRAILER.size + _SHA256_BYTES
     _require(len(data) >= smallest, f"{len(data)} bytes")
     magic, major, minor, header_length, header_crc = _PREAMBLE.unpack_from(data)
-    _require(magic == b"RLM1", f"the magic {magic!r}")
+    _require(magic == RLM_MAGIC, f"the magic {magic!r}")
     content, checksum = data[:-_SHA256_BYTES], data[-_SHA256_BYTES:]
     _require(hashlib.sha256(content).digest() == checksum, "another checksum")
     _require(major == FORMAT_MAJOR, f"format version {major}")
     header_bytes = content[_PREAMBLE.size : _PREAMBLE.size + header_length]
     _require(zlib.crc32(header_bytes) == header_crc, "another header checksum")
     header = _parse_header(header_bytes)
-    entries = _read_index(content, _PREAMBLE.size + header_length, header.line_count)
-    blocks = [_decode_block(content, entry, tuple(header.column_ids)) for entry in entries]
-    lower, upper = bounds_from_proto(header.bounds)
-    return MapFile(
-        line_map=line_map_from_rounded(_joined(blocks), _grid(header)),
-        provenance=_provenance(header.provenance),
-        frame_id=header.frame_id,
-        bounds_min_m=lower,
-        bounds_max_m=upper,
-        dropped_line_count=header.dropped_line_count,
+    return _Opened(
+        content=content,
+        header=header,
+        grid=_grid(header),
+        entries=_read_index(content, _PREAMBLE.size + header_length, header.line_count),
         format_version=(major, minor),
-        byte_count=len(data),
-        digest=file_digest(data),
     )
 
 
@@ -254,8 +338,7 @@ def _encode_block(lines: RoundedLines) -> bytes:
     return _BLOCK.pack(b"BLK1", length, len(lines), len(columns), 0, *_box(lines)) + body
 
 
-def _decode_block(content: bytes, entry: _IndexEntry, column_ids: tuple[int, ...]) -> RoundedLines:
-    block = content[entry.offset : entry.offset + entry.length]
+def _decode_block(block: bytes, entry: _IndexEntry, column_ids: tuple[int, ...]) -> RoundedLines:
     _require(hashlib.sha256(block).digest() == entry.sha256, "another block checksum")
     _require(len(block) >= _BLOCK.size, f"a block of {len(block)} bytes")
     magic, length, count, column_count, reserved, *box = _BLOCK.unpack_from(block)

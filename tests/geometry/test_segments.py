@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from roel_service.geometry.projection import fundamental_matrix, project
 from roel_service.geometry.se3 import SE3, rotation_from_vector
@@ -23,6 +24,7 @@ from roel_service.geometry.segments import (
     point_line_offset,
     point_segment_distance,
     position_along,
+    reaches_box,
     sensitivity_rad,
     uncertainty_m,
 )
@@ -290,3 +292,21 @@ def test_epipolar_iou_is_nan_for_a_line_along_its_epipolar_lines():
     )
     horizontal = np.array([[0.0, 0.5], [1.0, 0.5]])
     assert np.isnan(epipolar_iou(horizontal, horizontal, sideways))
+
+
+@given(hnp.arrays(np.float64, (1, 2, 3), elements=st.integers(-8, 8).map(float)))
+def test_a_segment_reaches_a_box_if_a_point_of_it_does(segments):
+    lower, upper = np.array([-2.0, -3.0, 0.0]), np.array([3.0, 1.0, 2.0])
+    # Ends are whole numbers at most 16 apart: where a segment enters and leaves is told by points
+    # whose spacing divides every such ratio.
+    shares = np.unique([i / d for d in range(1, 17) for i in range(d + 1)])
+    points = segments[:, 0] + shares[:, None] * (segments[:, 1] - segments[:, 0])
+    near = 1e-12
+    inside = ((points >= lower - near) & (points <= upper + near)).all(axis=1).any()
+    assert reaches_box(segments, lower - near, upper + near).item() == inside
+
+
+def test_every_segment_reaches_a_box_without_bounds():
+    segments = np.array([[[0.0, 0, 0], [1, 0, 0]], [[5.0, 5, 5], [5, 5, 5]]])
+    unbounded = np.full(3, np.inf)
+    assert reaches_box(segments, -unbounded, unbounded).all()

@@ -14,6 +14,7 @@ from roel_service.errors import (
     StateError,
 )
 from roel_service.v1 import config_pb2, maps_pb2, maps_pb2_grpc
+from roel_service.wire.configs import config_to_proto
 from roel_service.wire.results import report_from_proto
 from roel_service.wire.rlm import decode_map
 
@@ -326,3 +327,49 @@ def test_what_a_build_uses_cannot_be_deleted(client, map_name):
     assert stream_in_use.value.reason == "STREAM_IN_USE"
     client.delete_event_stream(stream)
     client.delete_map(map_name)
+
+
+def test_validating_a_build_changes_nothing(client, call, map_name, stream):
+    request = maps_pb2.BuildMapRequest(parent=map_name, event_stream=stream, validate_only=True)
+    operation = call("BuildMap", request)
+    version = maps_pb2.MapVersion()
+    assert (operation.name, operation.done) == ("", True)
+    assert operation.response.Unpack(version)
+    assert (version.name, version.event_stream) == (f"{map_name}/versions/v1", stream)
+    assert call("GetMap", maps_pb2.GetMapRequest(name=map_name)).version_count == 0
+    open_stream = client.create_event_stream(new_id(), CAMERA)
+    request = maps_pb2.BuildMapRequest(
+        parent=map_name, event_stream=open_stream, validate_only=True
+    )
+    with pytest.raises(StateError) as caught:
+        call("BuildMap", request)
+    assert caught.value.reason == "STREAM_NOT_FINALIZED"
+
+
+def test_the_same_build_twice_is_one_operation(client, call, map_name, stream):
+    request = maps_pb2.BuildMapRequest(
+        parent=map_name,
+        event_stream=stream,
+        config=config_to_proto(config_of(SLOW)),
+        request_id=str(uuid.uuid4()),
+    )
+    first = call("BuildMap", request)
+    try:
+        # A full queue refuses what is new, not what it holds.
+        waiting = client.build_map(client.create_map(new_id()), stream, config_of(SLOW))
+        assert call("BuildMap", request).name == first.name
+        waiting.cancel()
+        request.preset = "paper"
+        with pytest.raises(InputError) as caught:
+            call("BuildMap", request)
+        assert caught.value.reason == "REQUEST_ID_REUSED"
+    finally:
+        client.operation(first.name).cancel()
+    assert call("GetMap", maps_pb2.GetMapRequest(name=map_name)).version_count == 1
+
+
+def test_operations_of_a_deleted_map_can_still_be_asked_for(client, map_name, stream):
+    operation = client.build_map(map_name, stream, config_of(QUICK))
+    version = operation.wait()
+    client.delete_map(map_name)
+    assert client.operation(operation.name).wait() == version

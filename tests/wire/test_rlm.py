@@ -15,7 +15,13 @@ from roel_service.errors import MapFileError
 from roel_service.scene.lines import LineMap
 from roel_service.v1 import map_file_pb2
 from roel_service.wire.provenance import Provenance
-from roel_service.wire.rlm import BLOCK_LINE_COUNT, decode_map, encode_map, file_digest
+from roel_service.wire.rlm import (
+    BLOCK_LINE_COUNT,
+    MapBlocks,
+    decode_map,
+    encode_map,
+    file_digest,
+)
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -413,3 +419,27 @@ def test_bytes_that_no_frame_declares_are_refused():
     for content in (b"", b"no frame", bytes(120)):
         block.columns[1] = content
         refused(block.file())
+
+
+@pytest.mark.parametrize("count", [0, 5, BLOCK_LINE_COUNT + 3])
+def test_blocks_are_the_parts_of_the_file(count):
+    data = encode_map(random_map(count), PROVENANCE)
+    blocks = MapBlocks(data)
+    stored = [blocks.stored(block) for block in range(blocks.count)]
+    assert blocks.head + b"".join(stored) + blocks.tail == data
+    digests = [blocks.sha256(block) for block in range(blocks.count)]
+    assert digests == [hashlib.sha256(block).digest() for block in stored]
+    parts = [blocks.lines(block) for block in range(blocks.count)]
+    whole = decode_map(data).line_map
+    assert sum(len(part) for part in parts) == len(whole)
+    for block, part in enumerate(parts):
+        first = block * BLOCK_LINE_COUNT
+        assert np.array_equal(part.segments, whole.segments[first : first + BLOCK_LINE_COUNT])
+        lower, upper = blocks.bounds_m(block)
+        assert np.array_equal(part.segments.reshape(-1, 3).min(axis=0), lower)
+        assert np.array_equal(part.segments.reshape(-1, 3).max(axis=0), upper)
+
+
+def test_blocks_of_a_damaged_file_are_refused():
+    with pytest.raises(MapFileError, match="house: expected an undamaged line map"):
+        MapBlocks(encode_map(random_map(5), PROVENANCE)[:-1], subject="house")
