@@ -37,7 +37,7 @@ FRAME_COLUMNS = (
     ("offset, px", "offset_median_px", 2),
     ("bias, px", "bias_along_motion_px", 2),
     ("explained events", "explained_event_share", 2),
-    ("ms a frame", "ms_per_frame", 0),
+    ("CPU ms a frame", "ms_per_frame", 0),
 )
 Column = tuple[str, str, int]
 MISSING = "-"
