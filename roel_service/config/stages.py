@@ -315,6 +315,13 @@ class RefineConfig(Stage, table="refine"):
         iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as triangulated.
         max_residual_px: observations beyond it are left out of the next step.
         min_inlier_count: a line with fewer has diverged.
+        pose_gates_px: with free poses, distance within which lines take up observations, one value
+            a round of matching and refinement.
+        pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
+        pose_interval_us: control points of the poses' correction are so far apart.
+        pose_noise_px: noise of an observation as a whole, against the drift of the poses.
+        pose_drift_deg, pose_drift_m, pose_drift_s: how far the given poses wander off, standard
+            deviations, and the time after which they have forgotten it.
     """
 
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
@@ -329,6 +336,13 @@ class RefineConfig(Stage, table="refine"):
     iteration_count: int = parameter(8, UP_TO_1000)
     max_residual_px: float = parameter(2.0, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+    pose_gates_px: tuple[float, ...] = parameter((3.0, 2.5, 2.0, 1.5, 1.3), SOME_POSITIVE)
+    pose_iteration_count: int = parameter(6, UP_TO_1000)
+    pose_interval_us: int = parameter(100_000, Rule(">= 1000", lambda value: value >= 1000))
+    pose_noise_px: float = parameter(0.5, POSITIVE)
+    pose_drift_deg: float = parameter(0.25, POSITIVE)
+    pose_drift_m: float = parameter(0.005, POSITIVE)
+    pose_drift_s: float = parameter(1.5, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,7 +117,7 @@ class DirectionPrior:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _State:
+class OrthonormalLines:
     """Orthonormal lines about their own origins: U (L, 3, 3), phi (L,)."""
 
     U: FloatArray
@@ -129,15 +129,15 @@ class _State:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _System:
+class NormalEquations:
     """Normal equations of all lines: cost (L,), gradient (L, 4), Hessian (L, 4, 4)."""
 
     cost: FloatArray
     gradient: FloatArray
     hessian: FloatArray
 
-    def __add__(self, other: _System) -> _System:
-        return _System(
+    def __add__(self, other: NormalEquations) -> NormalEquations:
+        return NormalEquations(
             cost=self.cost + other.cost,
             gradient=self.gradient + other.gradient,
             hessian=self.hessian + other.hessian,
@@ -197,7 +197,7 @@ class _Problem:
         counts = np.maximum(np.diff(self.offsets), 1)
         return self.total(rows) / counts.reshape(-1, *[1] * (rows.ndim - 1))
 
-    def residual_px(self, state: _State) -> FloatArray:
+    def residual_px(self, state: OrthonormalLines) -> FloatArray:
         """(S,) larger end residual of each observation, px."""
         v, m = state.plucker
         views = self.evidence.views
@@ -219,7 +219,7 @@ class _Problem:
         widening = FIRST_GATE if loose else 1.0
         return np.asarray(residual_px < widening * self.config.max_residual_px)
 
-    def robust_weight(self, state: _State, residual_px: FloatArray) -> FloatArray:
+    def robust_weight(self, state: OrthonormalLines, residual_px: FloatArray) -> FloatArray:
         """(S,) weights of iterated reweighting."""
         if self.config.loss != "cauchy":
             return np.ones_like(residual_px)
@@ -227,25 +227,25 @@ class _Problem:
             residual_px = norm(self._end_distances_px(state))
         return np.asarray(1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2))
 
-    def cost(self, state: _State, weight: FloatArray) -> FloatArray:
+    def cost(self, state: OrthonormalLines, weight: FloatArray) -> FloatArray:
         """(L,) with fixed (S,) robust weights."""
         cost = self._form_cost(state, weight * self.form_weight)
         if self.config.residual != "pixel":
             cost = cost + self._line_system(state, weight * self.weight).cost
         if self.prior is not None:
-            cost = cost + _prior_system(state, self.prior).cost
+            cost = cost + direction_system(state, self.prior).cost
         return cost
 
-    def system(self, state: _State, weight: FloatArray) -> _System:
+    def system(self, state: OrthonormalLines, weight: FloatArray) -> NormalEquations:
         """Cost, gradient and Gauss-Newton Hessian with fixed (S,) robust weights."""
         system = self._form_system(state, weight * self.form_weight)
         if self.config.residual != "pixel":
             system = system + self._line_system(state, weight * self.weight)
         if self.prior is not None:
-            system = system + _prior_system(state, self.prior)
+            system = system + direction_system(state, self.prior)
         return system
 
-    def _form_cost(self, state: _State, weight: FloatArray) -> FloatArray:
+    def _form_cost(self, state: OrthonormalLines, weight: FloatArray) -> FloatArray:
         """(L,) sum w e with e = y^T G y / |m_c|^2, or w e^2."""
         v, m = state.plucker
         views = self.evidence.views
@@ -265,7 +265,7 @@ class _Problem:
             )
         )
 
-    def _form_system(self, state: _State, weight: FloatArray) -> _System:
+    def _form_system(self, state: OrthonormalLines, weight: FloatArray) -> NormalEquations:
         """Of sum w e with e = y^T G y / |m_c|^2, y the line in each camera's frame, or w e^2."""
         v, m = state.plucker
         dv, dm = plucker.plucker_jacobians(state.U, state.phi)
@@ -284,9 +284,9 @@ class _Problem:
             weight,
             self.quartic,
         )
-        return _System(cost=cost, gradient=gradient, hessian=hessian)
+        return NormalEquations(cost=cost, gradient=gradient, hessian=hessian)
 
-    def _line_system(self, state: _State, weight: FloatArray) -> _System:
+    def _line_system(self, state: OrthonormalLines, weight: FloatArray) -> NormalEquations:
         """Of the line term where it is not among the forms: sum w |r|^2, or w |r|^4."""
         if self.config.residual == "grassmann":
             r, J = self._plane_residuals(state)
@@ -296,19 +296,19 @@ class _Problem:
         slope = np.einsum("sij,si->sj", J, r)
         hessian = np.swapaxes(J, -1, -2) @ (weight[:, None, None] * J)
         if not self.quartic:
-            return _System(
+            return NormalEquations(
                 cost=self.total(weight * squared),
                 gradient=self.total(weight[:, None] * slope),
                 hessian=self.total(hessian),
             )
         bent = weight[:, None, None] * slope[:, :, None] * slope[:, None, :]
-        return _System(
+        return NormalEquations(
             cost=self.total(weight * squared**2),
             gradient=self.total((2.0 * weight * squared)[:, None] * slope),
             hessian=self.total(2.0 * squared[:, None, None] * hessian + 4.0 * bent),
         )
 
-    def _plane_residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
+    def _plane_residuals(self, state: OrthonormalLines) -> tuple[FloatArray, FloatArray]:
         """(S, 2) values (n.v, d / sqrt(1 + d^2)) at the middles of the observed intervals.
 
         Also their (S, 2, 4) derivatives.
@@ -322,7 +322,7 @@ class _Problem:
         )
         return r, by_line
 
-    def _end_residuals(self, state: _State) -> tuple[FloatArray, FloatArray]:
+    def _end_residuals(self, state: OrthonormalLines) -> tuple[FloatArray, FloatArray]:
         """(S, 2) signed distances of the observed ends, px, and their (S, 2, 4) derivatives."""
         by_line, _ = reprojection.end_line_jacobians(
             self.views.segment_px,
@@ -333,7 +333,7 @@ class _Problem:
         )
         return self._end_distances_px(state), by_line
 
-    def _end_distances_px(self, state: _State) -> FloatArray:
+    def _end_distances_px(self, state: OrthonormalLines) -> FloatArray:
         """(S, 2) signed distances of the observed ends from the images of their lines, px."""
         v, m = state.plucker
         return reprojection.end_line_distances_px(
@@ -345,7 +345,7 @@ class _Problem:
         """(S) T_world_camera about the origin of each row's line."""
         return SE3(rotation=self.rotation[self.views.frame], translation=self.views.centre)
 
-    def _middles_m(self, state: _State) -> FloatArray:
+    def _middles_m(self, state: OrthonormalLines) -> FloatArray:
         """(L,) mean arc length of the middles of the observed intervals that cut the line."""
         v, m = state.plucker
         cuts, _ = cuts_m(self.views, v[self.line], m[self.line])
@@ -354,13 +354,13 @@ class _Problem:
         return self.total(np.nan_to_num(middles)) / np.maximum(counts, 1.0)
 
 
-def _prior_system(state: _State, prior: DirectionPrior) -> _System:
+def direction_system(state: OrthonormalLines, prior: DirectionPrior) -> NormalEquations:
     """Of sum w |v x d|^2, the squared sine between line and direction."""
     v, _ = state.plucker
     dv, _ = plucker.plucker_jacobians(state.U, state.phi)
     r = np.cross(v, prior.direction)
     J = np.cross(dv, prior.direction[..., None], axisa=-2, axisb=-2, axisc=-2)
-    return _System(
+    return NormalEquations(
         cost=prior.weight * dot(r, r),
         gradient=prior.weight[:, None] * np.einsum("lij,li->lj", J, r),
         hessian=prior.weight[:, None, None] * np.swapaxes(J, -1, -2) @ J,
@@ -388,7 +388,7 @@ def refine_lines(
     problem = _Problem(lines, tracks, evidence, frames, config, prior)
     moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
-    state = _State(U=U, phi=phi)
+    state = OrthonormalLines(U=U, phi=phi)
     damping = np.full(len(lines), FIRST_DAMPING)
     weight = np.zeros(len(problem.line))
     for iteration in range(config.iteration_count):
@@ -408,8 +408,8 @@ def refine_lines(
 
 
 def _step(
-    problem: _Problem, state: _State, weight: FloatArray, damping: FloatArray
-) -> tuple[_State, FloatArray]:
+    problem: _Problem, state: OrthonormalLines, weight: FloatArray, damping: FloatArray
+) -> tuple[OrthonormalLines, FloatArray]:
     """One damped step of every line; a line whose cost would grow stays and is damped more."""
     system = problem.system(state, weight)
     diagonal = np.einsum("lii->li", system.hessian)
@@ -420,10 +420,10 @@ def _step(
     turn = np.linalg.norm(delta[:, :3], axis=1)
     delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
     U, phi = plucker.retract_orthonormal(state.U, state.phi, delta)
-    trial = _State(U=U, phi=phi)
+    trial = OrthonormalLines(U=U, phi=phi)
     better = problem.cost(trial, weight) <= system.cost
     return (
-        _State(
+        OrthonormalLines(
             U=np.where(better[:, None, None], trial.U, state.U),
             phi=np.where(better, trial.phi, state.phi),
         ),
@@ -434,7 +434,7 @@ def _step(
 def _refined(
     problem: _Problem,
     tracks: LineTracks,
-    state: _State,
+    state: OrthonormalLines,
     residual_px: FloatArray,
     inlier: BoolArray,
     information: FloatArray,

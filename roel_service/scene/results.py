@@ -135,3 +135,40 @@ class RegistrationResult:
     @property
     def converged(self) -> bool:
         return self.stop_reason is StopReason.CONVERGED
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseReport:
+    """How poses were refined.
+
+    Attributes:
+        line_count: lines that held the poses.
+        observation_count: their observations in use at the end.
+        iteration_count: steps, over all rounds.
+        converged: the last round ended because a step changed next to nothing.
+        cost_initial, cost_final: mean squared distance of an observation in use, px^2, before the
+            first and after the last step.
+        seconds: wall-clock time of each stage.
+    """
+
+    line_count: int
+    observation_count: int
+    iteration_count: int
+    converged: bool
+    cost_initial: float
+    cost_final: float
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseResult:
+    """A trajectory after refinement.
+
+    Attributes:
+        trajectory: at the times that were given.
+        covariance: (N, 6, 6) of each pose, order (r, d), rad and m, world.
+    """
+
+    trajectory: Trajectory
+    covariance: FloatArray
+    report: PoseReport

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import skew
-from roel_service.mapping.refine import _Problem, _State, refine_lines
+from roel_service.mapping.refine import OrthonormalLines, _Problem, refine_lines
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
 from .synthetic import line_errors, perturbed, world
@@ -60,7 +60,7 @@ def start_of(problem, lines):
     """The lines as the first step sees them."""
     moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
-    return _State(U=U, phi=phi)
+    return OrthonormalLines(U=U, phi=phi)
 
 
 class TestExact:
@@ -132,7 +132,7 @@ class TestGradient:
         lines = perturbed(noisy.lines, 0.02, 0.02 * scale, seed=draw)
         moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
         U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
-        state = _State(U=U, phi=phi)
+        state = OrthonormalLines(U=U, phi=phi)
         # As within one step: the points at which lines are compared, and robust weights, are held.
         middles_m = problem._middles_m(state)
         problem._middles_m = lambda state: middles_m
@@ -141,7 +141,7 @@ class TestGradient:
 
         def cost(delta):
             U_moved, phi_moved = plucker.retract_orthonormal(U, phi, np.tile(delta, (len(U), 1)))
-            return problem.system(_State(U=U_moved, phi=phi_moved), weight).cost
+            return problem.system(OrthonormalLines(U=U_moved, phi=phi_moved), weight).cost
 
         # The last number turns the distance: d|m| = |m|^2 d phi, so its step shrinks with scale.
         steps = np.array([1e-5, 1e-5, 1e-5, 1e-5 / scale])
@@ -161,12 +161,12 @@ class TestGradient:
         moment = plucker.shift_origin(exact.lines.direction, exact.lines.moment, problem.origin)
         U, phi = plucker.orthonormal_from_plucker(exact.lines.direction, moment)
         weight = np.ones(len(problem.line))
-        hessian = problem.system(_State(U=U, phi=phi), weight).hessian
+        hessian = problem.system(OrthonormalLines(U=U, phi=phi), weight).hessian
         columns = []
         for step in 1e-6 * np.eye(4):
             ahead, back = (
                 problem.system(
-                    _State(
+                    OrthonormalLines(
                         **dict(
                             zip(
                                 ("U", "phi"),

@@ -1,0 +1,332 @@
+"""Lines and poses refined together.
+
+Paper: "Multi-view Line Optimization" with free poses; the cost is the quadratic form of `refine`,
+`residual = "pixel"`. The poses follow a smooth correction of the given trajectory
+(`pose_correction`) in place of one free pose a frame: what moves faster than its control points is
+taken for noise of the observations. Damped Gauss-Newton; the lines, which share no observation, are
+eliminated first (Schur complement), and what is left is a dense system of the control points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg
+
+from roel_service.arrays import FloatArray
+from roel_service.config.stages import RefineConfig
+from roel_service.geometry import plucker
+from roel_service.mapping import joint_kernels, refine_kernels
+from roel_service.mapping.evidence import Evidence
+from roel_service.mapping.frames import Frames
+from roel_service.mapping.pose_correction import PoseCorrection, drift_information
+from roel_service.mapping.refine import (
+    DAMPING_AFTER_FAILURE,
+    DAMPING_AFTER_SUCCESS,
+    FIRST_DAMPING,
+    FIRST_GATE,
+    LOOSE_ITERATION_COUNT,
+    MAX_TURN_RAD,
+    RIDGE,
+    DirectionPrior,
+    OrthonormalLines,
+    Refined,
+    direction_system,
+)
+from roel_service.mapping.views import views_of
+from roel_service.scene.lines import InfiniteLines, LineObservations
+
+# Steps that are tried, each damped more, before the present state counts as the best one.
+MAX_TRIAL_COUNT = 6
+# A step that lowers the cost by less than this share ends the iteration.
+CONVERGED_SHARE = 1e-4
+# Doubles of the blocks that are in memory at a time while lines are eliminated: 64 MiB.
+BLOCK_SIZE = 2**23
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class JointlyRefined:
+    """Lines and the correction of the poses that they were refined with.
+
+    Attributes:
+        lines: L lines, world.
+        correction: of the trajectory that the frames' poses came from.
+        information: (6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2.
+        costs: after each step, the first one before any; in units of the observations' noise.
+        converged: the last step changed next to nothing.
+    """
+
+    lines: InfiniteLines
+    correction: PoseCorrection
+    information: FloatArray
+    costs: list[float]
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _State:
+    lines: OrthonormalLines
+    correction: PoseCorrection
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _System:
+    """Normal equations of lines, control points, and of each row between them.
+
+    Attributes:
+        cost: of everything.
+        line_gradient, line_hessian: (L, 4) and (L, 4, 4).
+        control_gradient, control_hessian: (6 K,) and (6 K, 6 K).
+        rows: (S, 4, 6) by line and pose.
+    """
+
+    cost: float
+    line_gradient: FloatArray
+    line_hessian: FloatArray
+    control_gradient: FloatArray
+    control_hessian: FloatArray
+    rows: FloatArray
+
+
+def refine_jointly(
+    refined: Refined,
+    correction: PoseCorrection,
+    observations: LineObservations,
+    evidence: Evidence,
+    frames: Frames,
+    config: RefineConfig,
+    directions: DirectionPrior | None,
+) -> JointlyRefined:
+    """Refine lines and the correction of the poses over the lines' observations.
+
+    Args:
+        refined: L first estimates with their tracks.
+        correction: the first estimate, of what `frames` lacks.
+        observations, evidence: of all frames.
+        frames: with the poses that the correction applies to.
+        config: loss, gates, noise of an observation, drift of the poses and number of steps.
+        directions: that lines are held to.
+    """
+    problem = _Problem(refined, correction, observations, evidence, frames, config, directions)
+    state = problem.first_state(refined.lines, correction)
+    damping = FIRST_DAMPING
+    costs: list[float] = []
+    converged = False
+    for iteration in range(config.pose_iteration_count):
+        weight = problem.weight(state, loose=iteration < LOOSE_ITERATION_COUNT)
+        system = problem.system(state, weight)
+        costs.append(system.cost)
+        for _ in range(MAX_TRIAL_COUNT):
+            trial = problem.step(state, system, damping)
+            cost = problem.cost(trial, weight)
+            if cost <= system.cost:
+                break
+            damping *= DAMPING_AFTER_FAILURE
+        else:
+            converged = True
+            break
+        state = trial
+        damping *= DAMPING_AFTER_SUCCESS
+        converged = system.cost - cost <= CONVERGED_SHARE * system.cost
+        if converged and iteration >= LOOSE_ITERATION_COUNT:
+            break
+    system = problem.system(state, problem.weight(state, loose=False))
+    return JointlyRefined(
+        lines=problem.world_lines(state),
+        correction=state.correction,
+        information=problem.reduced(system, 0.0)[0],
+        costs=[*costs, system.cost],
+        converged=converged,
+    )
+
+
+class _Problem:
+    """The observations of all lines in one list, each row with its line and frame."""
+
+    def __init__(
+        self,
+        refined: Refined,
+        correction: PoseCorrection,
+        observations: LineObservations,
+        evidence: Evidence,
+        frames: Frames,
+        config: RefineConfig,
+        directions: DirectionPrior | None,
+    ) -> None:
+        self.config = config
+        self.observations = observations
+        self.frames = frames
+        self.frame_of = evidence.views.frame
+        self.offsets = refined.tracks.offsets
+        self.observation = refined.tracks.observation
+        self.line = refined.tracks.track_of_row
+        self.origin = refined.origin
+        self.directions = directions
+        self.precision = config.pose_noise_px**-2
+        self.forms = frames.focal_px**2 * (
+            evidence.segment_forms + config.event_weight * evidence.event_forms
+        )
+        length_px = evidence.views.length_px[self.observation]
+        most_px = config.max_length_weight_px
+        self.length_weight = np.minimum(length_px, most_px) / most_px
+        self.first_control, self.basis = correction.basis(frames.t_us)
+        self.shares = correction.shares(frames.t_us)
+        self.drift = drift_information(correction, config)
+
+    def first_state(self, lines: InfiniteLines, correction: PoseCorrection) -> _State:
+        moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
+        U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
+        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction)
+
+    def world_lines(self, state: _State) -> InfiniteLines:
+        direction, moment = state.lines.plucker
+        moment = plucker.shift_origin(direction, moment, -self.origin)
+        return InfiniteLines(direction=direction, moment=moment)
+
+    def moved_frames(self, state: _State) -> Frames:
+        """The frames with corrected poses."""
+        poses = state.correction.applied(self.frames.t_us, self.frames.T_world_camera)
+        return replace(self.frames, T_world_camera=poses)
+
+    def weight(self, state: _State, *, loose: bool) -> FloatArray:
+        """(S,) weights of iterated reweighting, 0 for outliers."""
+        v, m = state.lines.plucker
+        views = views_of(self.observations, self.moved_frames(state))
+        residual_px = refine_kernels.end_residuals(
+            self.offsets,
+            self.origin,
+            v,
+            m,
+            views.centre,
+            views.end_rays,
+            self.observation,
+            self.frames.focal_px,
+        )
+        gate_px = self.config.max_residual_px * (FIRST_GATE if loose else 1.0)
+        robust = 1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2)
+        return np.asarray(
+            np.where(residual_px < gate_px, robust, 0.0) * self.length_weight * self.precision
+        )
+
+    def cost(self, state: _State, weight: FloatArray) -> float:
+        """Of lines, directions and drift, with fixed (S,) weights."""
+        v, m = state.lines.plucker
+        poses = self.moved_frames(state).T_world_camera
+        cost = refine_kernels.form_cost(
+            self.offsets,
+            self.origin,
+            v,
+            m,
+            poses.rotation,
+            poses.translation[self.frame_of],
+            self.frame_of,
+            self.observation,
+            self.forms,
+            weight,
+            False,
+        )
+        control = state.correction.control.ravel()
+        total = float(cost.sum()) + float(control @ self.drift @ control)
+        if self.directions is not None:
+            held = direction_system(state.lines, self.directions)
+            total += self.precision * float(held.cost.sum())
+        return total
+
+    def system(self, state: _State, weight: FloatArray) -> _System:
+        """Normal equations with fixed (S,) weights."""
+        v, m = state.lines.plucker
+        dv, dm = plucker.plucker_jacobians(state.lines.U, state.lines.phi)
+        poses = self.moved_frames(state).T_world_camera
+        cost, by_line, by_lines, by_pose, by_poses, rows = joint_kernels.joint_system(
+            self.offsets,
+            self.origin,
+            v,
+            m,
+            np.concatenate([dv, dm], axis=-2),
+            poses.rotation,
+            poses.translation,
+            self.frame_of,
+            self.observation,
+            self.forms,
+            weight,
+        )
+        control = state.correction.control.ravel()
+        total = float(cost.sum()) + float(control @ self.drift @ control)
+        if self.directions is not None:
+            held = direction_system(state.lines, self.directions)
+            total += self.precision * float(held.cost.sum())
+            by_line = by_line + self.precision * held.gradient
+            by_lines = by_lines + self.precision * held.hessian
+        size = 6 * len(state.correction)
+        spread = np.einsum("nk,nij->nkij", self.shares, by_poses)
+        hessian = np.tensordot(spread, self.shares, axes=(0, 0)).transpose(0, 1, 3, 2)
+        return _System(
+            cost=total,
+            line_gradient=by_line,
+            line_hessian=by_lines,
+            control_gradient=(self.shares.T @ by_pose).ravel() + self.drift @ control,
+            control_hessian=hessian.reshape(size, size) + self.drift,
+            rows=rows,
+        )
+
+    def reduced(self, system: _System, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The system of the control points alone, and what solves for a line: (L, 4, 4) inverses."""
+        diagonal = np.einsum("lii->li", system.line_hessian)
+        damped = system.line_hessian + np.einsum(
+            "li,ij->lij", damping * diagonal + RIDGE, np.eye(4)
+        )
+        inverse = np.linalg.inv(damped)
+        # (L, 4, 4) with factor^T factor = inverse: the product below stays symmetric.
+        factor = np.swapaxes(np.linalg.cholesky(inverse), -1, -2)
+        hessian, gradient = system.control_hessian.copy(), system.control_gradient.copy()
+        for lines, blocks in self._blocks(system):
+            solved = (factor[lines] @ blocks).reshape(-1, hessian.shape[0])
+            hessian -= solved.T @ solved
+            weighted = np.einsum("lij,lj->li", inverse[lines], system.line_gradient[lines])
+            gradient -= np.einsum("lik,li->k", blocks, weighted)
+        hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
+        return hessian, gradient, inverse
+
+    def _blocks(self, system: _System) -> Iterator[tuple[slice, FloatArray]]:
+        """Lines in turn with their (l, 4, 6 K) blocks by the control points."""
+        control_count = self.shares.shape[1]
+        step = max(1, BLOCK_SIZE // (4 * 6 * control_count))
+        line_count = len(self.offsets) - 1
+        for first in range(0, line_count, step):
+            last = min(first + step, line_count)
+            yield (
+                slice(first, last),
+                joint_kernels.by_control(
+                    self.offsets,
+                    self.frame_of,
+                    self.observation,
+                    system.rows,
+                    self.first_control,
+                    self.basis,
+                    control_count,
+                    first,
+                    last,
+                ),
+            )
+
+    def step(self, state: _State, system: _System, damping: float) -> _State:
+        """One damped step of everything."""
+        hessian, gradient, inverse = self.reduced(system, damping)
+        control = -linalg.solve(hessian, gradient, assume_a="pos").reshape(-1, 6)
+        by_pose = (self.shares @ control)[self.frame_of[self.observation]]
+        pulls = np.einsum("sij,sj->si", system.rows, by_pose)
+        pull = np.stack([self._total(column) for column in pulls.T], axis=1)
+        delta = -np.einsum("lij,lj->li", inverse, system.line_gradient + pull)
+        turn = np.linalg.norm(delta[:, :3], axis=1)
+        delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
+        U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, delta)
+        return _State(
+            lines=OrthonormalLines(U=U, phi=phi), correction=state.correction.stepped(control)
+        )
+
+    def _total(self, rows: FloatArray) -> FloatArray:
+        """(L,) sums of (S,) rows over each line."""
+        sums = np.bincount(self.line, rows, minlength=len(self.offsets) - 1)
+        return np.asarray(sums, dtype=np.float64)
