@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,3 +34,12 @@ StepCallback = Callable[[int, int], None]
 
 def ignore(progress: Progress) -> None:
     """Let the algorithm run; nobody is watching."""
+
+
+def part_of(progress: ProgressCallback, begin: float, end: float) -> ProgressCallback:
+    """For a job that is the part of another one from `begin` to `end`, shares of the whole."""
+
+    def told(step: Progress) -> None:
+        progress(replace(step, fraction=begin + (end - begin) * step.fraction))
+
+    return told

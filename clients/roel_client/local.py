@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
-    from roel_service.scene.results import RegistrationResult
+    from roel_service.scene.results import PoseResult, RegistrationResult
     from roel_service.scene.trajectory import Trajectory
     from roel_service.wire.rlm import MapFile
 
@@ -47,10 +47,15 @@ class Recording:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Built:
-    """A finished map as a file's bytes, and the report of its build."""
+    """A finished map as a file's bytes, and the report of its build.
+
+    Attributes:
+        trajectory: the poses of the map, where it was built in this process.
+    """
 
     rlm_bytes: bytes
     report: dict[str, Any]
+    trajectory: Trajectory | None = None
 
 
 def open_recording(
@@ -81,7 +86,7 @@ def build_map(recording: Recording, config: Config, progress: ProgressCallback) 
         built = build.build_map(
             recording.events, recording.trajectory, recording.camera, config, progress
         )
-    return Built(rlm_bytes=built.rlm_bytes, report=built.report)
+    return Built(rlm_bytes=built.rlm_bytes, report=built.report, trajectory=built.trajectory)
 
 
 def build_map_remotely(
@@ -112,7 +117,38 @@ def draw_map(built: Built, recording: Recording, path: Path) -> None:
     from roel_service.wire.rlm import decode_map
 
     line_map = decode_map(built.rlm_bytes).line_map
-    figures.draw_map(line_map, recording.trajectory, recording.camera, recording.events, path)
+    trajectory = built.trajectory or recording.trajectory
+    figures.draw_map(line_map, trajectory, recording.camera, recording.events, path)
+
+
+def write_poses(trajectory: Trajectory, path: Path) -> None:
+    """Write poses as TUM text."""
+    from roel_service.io.poses import write_trajectory
+
+    write_trajectory(path, trajectory)
+
+
+def refine_poses(
+    recording: Recording, map_name: str | None, config: Config, progress: ProgressCallback
+) -> PoseResult:
+    """Refine the poses of a recording, with its own lines or against those of a map.
+
+    Raises:
+        NoAnswerError: too few lines.
+        RoelError: whatever reading and refining raise.
+    """
+    from roel_service.mapping import refine_poses as poses
+
+    line_map = None if map_name is None else _read_map(map_name)
+    with naming(recording.names):
+        return poses.refine_poses(
+            recording.events,
+            recording.trajectory,
+            recording.camera,
+            config,
+            line_map=line_map,
+            progress=progress,
+        )
 
 
 def read_map_file(name: str) -> MapFile:

@@ -315,6 +315,7 @@ class RefineConfig(Stage, table="refine"):
         iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as triangulated.
         max_residual_px: observations beyond it are left out of the next step.
         min_inlier_count: a line with fewer has diverged.
+        free_poses: refine the poses together with the lines, then map with the refined ones.
         pose_gates_px: with free poses, distance within which lines take up observations, one value
             a round of matching and refinement.
         pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
@@ -336,9 +337,10 @@ class RefineConfig(Stage, table="refine"):
     iteration_count: int = parameter(8, UP_TO_1000)
     max_residual_px: float = parameter(2.0, POSITIVE)
     min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+    free_poses: bool = False
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.5, 2.0, 1.5, 1.3), SOME_POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)
-    pose_interval_us: int = parameter(100_000, Rule(">= 1000", lambda value: value >= 1000))
+    pose_interval_us: int = parameter(100_000, POSITIVE)
     pose_noise_px: float = parameter(0.5, POSITIVE)
     pose_drift_deg: float = parameter(0.25, POSITIVE)
     pose_drift_m: float = parameter(0.005, POSITIVE)

@@ -1,4 +1,4 @@
-"""Estimated poses against true ones: errors, alignment, absolute trajectory error, success."""
+"""Estimated poses against true ones: errors, absolute trajectory error, success."""
 
 from __future__ import annotations
 
@@ -8,21 +8,9 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.errors import TrajectoryError
+from roel_service.geometry.alignment import align_points
 from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.scene.trajectory import Trajectory
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Similarity:
-    """p_target = scale * rotation(T_target_source) p_source + translation(T_target_source)."""
-
-    scale: float
-    T_target_source: SE3
-
-    def apply(self, points: FloatArray) -> FloatArray:
-        """(N, 3) points in the target frame."""
-        moved = self.scale * self.T_target_source.rotate(points)
-        return np.asarray(moved + self.T_target_source.translation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,27 +48,6 @@ def success_rate(estimate: SE3, truth: SE3, max_distance_m: float, max_angle_deg
     near = translation_errors_m(estimate, truth) <= max_distance_m
     turned = np.degrees(rotation_errors_rad(estimate, truth)) <= max_angle_deg
     return float((near & turned).mean()) if near.size else 0.0
-
-
-def align_points(source: FloatArray, target: FloatArray, *, with_scale: bool) -> Similarity:
-    """Least-squares alignment of corresponding points (Umeyama 1991).
-
-    Where the points lie on one line, any turn about it is as good; one of them is returned.
-
-    Args:
-        source, target: (N, 3) m, N >= 1.
-        with_scale: whether the scale is free; it stays 1 where the source is one point.
-    """
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    source_offsets, target_offsets = source - source_mean, target - target_mean
-    U, singular, Vt = np.linalg.svd(target_offsets.T @ source_offsets)
-    # The nearest orthogonal matrix may be a reflection; then the weakest axis is turned over.
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    rotation = (U * signs) @ Vt
-    spread = float((source_offsets**2).sum())
-    scale = float((singular * signs).sum()) / spread if with_scale and spread > 0.0 else 1.0
-    translation = target_mean - scale * rotation @ source_mean
-    return Similarity(scale=scale, T_target_source=SE3(rotation=rotation, translation=translation))
 
 
 def trajectory_errors(

@@ -137,6 +137,21 @@ def rotation_from_vector(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + sine * cross + cosine * (cross @ cross), dtype=np.float64)
 
 
+def rotation_vector_jacobian(vectors: FloatArray) -> FloatArray:
+    """(*B, 3, 3) J of (*B, 3) rotation vectors r with Exp(r + dr) = Exp(J dr) Exp(r), for small dr.
+
+    The left Jacobian of SO(3): J = I + (1 - cos a) / a^2 [r]x + (a - sin a) / a^3 [r]x^2, a = |r|.
+    """
+    vectors = np.asarray(vectors, dtype=np.float64)
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < SMALL_ANGLE_RAD
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5 - angle**2 / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0 - angle**2 / 120.0, (safe - np.sin(safe)) / safe**3)
+    cross = skew(vectors)
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross), dtype=np.float64)
+
+
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     """(*B, 3) rotation vectors in radians of (*B, 3, 3) rotations, angle in [0, pi]."""
     flat = Rotation.from_matrix(np.asarray(rotation).reshape(-1, 3, 3)).as_rotvec()

@@ -46,11 +46,13 @@ class BuiltMap:
     Attributes:
         rlm_bytes: the map file.
         line_map: the lines as the file holds them.
+        trajectory: the poses of the map; those that were given unless they were refined.
         report: with the keys that `roel map build` prints.
     """
 
     rlm_bytes: bytes
     line_map: LineMap
+    trajectory: Trajectory
     report: Report
 
 
@@ -106,7 +108,9 @@ def build_map(
         expected = f"at least {MIN_LINE_COUNT} lines"
         found = f"{len(line_map)}"
         raise NoAnswerError("map", expected, found, reason="TOO_FEW_LINES", result=report)
-    return BuiltMap(rlm_bytes=rlm_bytes, line_map=line_map, report=report)
+    return BuiltMap(
+        rlm_bytes=rlm_bytes, line_map=line_map, trajectory=result.trajectory, report=report
+    )
 
 
 def config_digest(config: Config) -> str:
@@ -130,7 +134,7 @@ def versions() -> dict[str, str]:
 
 
 class _DigestedSource:
-    """A source that takes the digest of the events while they pass by."""
+    """A source that takes the digest of the events while they pass by, each time anew."""
 
     def __init__(self, source: EventSource) -> None:
         self._source = source
@@ -150,6 +154,7 @@ class _DigestedSource:
 
     def chunks(self) -> Iterator[EventStream]:
         """The chunks of the source."""
+        self.digest = EventDigest()
         for chunk in self._source.chunks():
             self.digest.update(chunk)
             yield chunk

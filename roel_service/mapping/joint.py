@@ -18,9 +18,10 @@ from scipy import linalg
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker
+from roel_service.geometry.se3 import rotation_vector_jacobian
 from roel_service.mapping import joint_kernels, refine_kernels
-from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
+from roel_service.mapping.front_end import Detected
 from roel_service.mapping.pose_correction import PoseCorrection, drift_information
 from roel_service.mapping.refine import (
     DAMPING_AFTER_FAILURE,
@@ -36,7 +37,7 @@ from roel_service.mapping.refine import (
     direction_system,
 )
 from roel_service.mapping.views import views_of
-from roel_service.scene.lines import InfiniteLines, LineObservations
+from roel_service.scene.lines import InfiniteLines
 
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 6
@@ -93,23 +94,23 @@ class _System:
 def refine_jointly(
     refined: Refined,
     correction: PoseCorrection,
-    observations: LineObservations,
-    evidence: Evidence,
-    frames: Frames,
+    detected: Detected,
     config: RefineConfig,
     directions: DirectionPrior | None,
+    *,
+    free_lines: bool = True,
 ) -> JointlyRefined:
     """Refine lines and the correction of the poses over the lines' observations.
 
     Args:
         refined: L first estimates with their tracks.
-        correction: the first estimate, of what `frames` lacks.
-        observations, evidence: of all frames.
-        frames: with the poses that the correction applies to.
+        correction: the first estimate, of what the poses of the frames lack.
+        detected: the frames with the poses that the correction applies to, and what was seen.
         config: loss, gates, noise of an observation, drift of the poses and number of steps.
         directions: that lines are held to.
+        free_lines: whether the lines move too.
     """
-    problem = _Problem(refined, correction, observations, evidence, frames, config, directions)
+    problem = _Problem(refined, correction, detected, config, directions, free_lines=free_lines)
     state = problem.first_state(refined.lines, correction)
     damping = FIRST_DAMPING
     costs: list[float] = []
@@ -149,14 +150,16 @@ class _Problem:
         self,
         refined: Refined,
         correction: PoseCorrection,
-        observations: LineObservations,
-        evidence: Evidence,
-        frames: Frames,
+        detected: Detected,
         config: RefineConfig,
         directions: DirectionPrior | None,
+        *,
+        free_lines: bool,
     ) -> None:
+        frames, evidence = detected.frames, detected.evidence
         self.config = config
-        self.observations = observations
+        self.free_lines = free_lines
+        self.observations = detected.observations
         self.frames = frames
         self.frame_of = evidence.views.frame
         self.offsets = refined.tracks.offsets
@@ -259,6 +262,10 @@ class _Problem:
             total += self.precision * float(held.cost.sum())
             by_line = by_line + self.precision * held.gradient
             by_lines = by_lines + self.precision * held.hessian
+        by_tangent = self._pose_by_tangent(state)
+        by_pose = np.einsum("nij,ni->nj", by_tangent, by_pose)
+        by_poses = np.swapaxes(by_tangent, -1, -2) @ by_poses @ by_tangent
+        rows = rows @ by_tangent[self.frame_of[self.observation]]
         size = 6 * len(state.correction)
         spread = np.einsum("nk,nij->nkij", self.shares, by_poses)
         hessian = np.tensordot(spread, self.shares, axes=(0, 0)).transpose(0, 1, 3, 2)
@@ -271,6 +278,13 @@ class _Problem:
             rows=rows,
         )
 
+    def _pose_by_tangent(self, state: _State) -> FloatArray:
+        """(N, 6, 6) how a pose steps (r, d) when its correction's tangent changes."""
+        tangent = self.shares @ state.correction.control
+        derivative = np.tile(np.eye(6), (len(tangent), 1, 1))
+        derivative[:, :3, :3] = rotation_vector_jacobian(tangent[:, :3])
+        return derivative
+
     def reduced(self, system: _System, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The system of the control points alone, and what solves for a line: (L, 4, 4) inverses."""
         diagonal = np.einsum("lii->li", system.line_hessian)
@@ -281,7 +295,7 @@ class _Problem:
         # (L, 4, 4) with factor^T factor = inverse: the product below stays symmetric.
         factor = np.swapaxes(np.linalg.cholesky(inverse), -1, -2)
         hessian, gradient = system.control_hessian.copy(), system.control_gradient.copy()
-        for lines, blocks in self._blocks(system):
+        for lines, blocks in self._blocks(system) if self.free_lines else ():
             solved = (factor[lines] @ blocks).reshape(-1, hessian.shape[0])
             hessian -= solved.T @ solved
             weighted = np.einsum("lij,lj->li", inverse[lines], system.line_gradient[lines])
@@ -315,6 +329,9 @@ class _Problem:
         """One damped step of everything."""
         hessian, gradient, inverse = self.reduced(system, damping)
         control = -linalg.solve(hessian, gradient, assume_a="pos").reshape(-1, 6)
+        correction = state.correction.stepped(control)
+        if not self.free_lines:
+            return _State(lines=state.lines, correction=correction)
         by_pose = (self.shares @ control)[self.frame_of[self.observation]]
         pulls = np.einsum("sij,sj->si", system.rows, by_pose)
         pull = np.stack([self._total(column) for column in pulls.T], axis=1)
@@ -322,9 +339,7 @@ class _Problem:
         turn = np.linalg.norm(delta[:, :3], axis=1)
         delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
         U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, delta)
-        return _State(
-            lines=OrthonormalLines(U=U, phi=phi), correction=state.correction.stepped(control)
-        )
+        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction)
 
     def _total(self, rows: FloatArray) -> FloatArray:
         """(L,) sums of (S,) rows over each line."""

@@ -7,10 +7,12 @@ in rounds of shrinking distance. The paper's own scheme is in `match_sampled`.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import sparse
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import FloatArray, IntArray
 from roel_service.config.stages import Config, MatchGlobalConfig, RefineConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3
@@ -79,6 +81,36 @@ def reassociate(
     return refined
 
 
+def match_fixed_lines(
+    lines: InfiniteLines,
+    spans: FloatArray,
+    evidence: Evidence,
+    observations: LineObservations,
+    frames: Frames,
+    trajectory: Trajectory,
+    config: Config,
+) -> Refined:
+    """The observations along lines that are known and stay as they are; lines without are left out.
+
+    Args:
+        lines: L lines, world.
+        spans: (L, 2, 3) their segments, world.
+        evidence, observations: of all frames.
+        frames, trajectory: poses, off by no more than the first of
+            `match_global.max_distances_px`.
+        config: as of `reassociate`.
+    """
+    settings = config.match_global
+    velocity = _velocities(frames, trajectory) if config.frames.compensate_rotation else None
+    distance_px = settings.max_distances_px[0]
+    pairs = _along(lines, spans, observations, frames, velocity, distance_px, settings)
+    stay = replace(config.refine, iteration_count=0)
+    tracks = LineTracks.from_rows(*pairs, len(lines))
+    found = _usable(refine_lines(lines, tracks, evidence, frames, stay))
+    exclusive = _exclusive(found, evidence.views, frames)
+    return _usable(refine_lines(found.lines, exclusive, evidence, frames, stay))
+
+
 def _held(
     refined: Refined, tracks: LineTracks, evidence: Evidence, frames: Frames, config: RefineConfig
 ) -> Refined:
@@ -112,13 +144,37 @@ def _associate(
 ) -> LineTracks:
     """Each line's inliers so far, and every observation that lies along its projection."""
     spans = _lengthened(refined, views)
+    line, member = _along(
+        refined.lines, spans, observations, frames, velocity, max_distance_px, config
+    )
+    line = np.concatenate([refined.tracks.track_of_row, line])
+    member = np.concatenate([refined.tracks.observation, member])
+    pairs = np.unique(np.stack([line, member]), axis=1)
+    return LineTracks.from_rows(pairs[0], pairs[1], len(refined))
+
+
+def _along(
+    lines: InfiniteLines,
+    spans: FloatArray,
+    observations: LineObservations,
+    frames: Frames,
+    velocity: FloatArray | None,
+    max_distance_px: float,
+    config: MatchGlobalConfig,
+) -> tuple[IntArray, IntArray]:
+    """Lines (n,) and observations (n,), pairwise, that lie along each other in a frame.
+
+    Args:
+        lines: L lines, world.
+        spans: (L, 2, 3) the parts of them to look along, world.
+        velocity: (N, 3) of the camera, to compare speeds; None leaves them out.
+    """
     first = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
-    lines = [refined.tracks.track_of_row]
-    members = [refined.tracks.observation]
+    found: list[IntArray] = [np.empty((2, 0), np.int64)]
     for frame in range(len(frames)):
         T_camera_world = frames.T_world_camera[frame].inverse()
         projected = project_segments(spans, T_camera_world, frames)
-        image_line, its_rate = _image_lines(refined.lines, frames, frame, velocity)
+        image_line, its_rate = _image_lines(lines, frames, frame, velocity)
         current = slice(first[frame], first[frame + 1])
         line, member = match_global_kernels.observations_along(
             projected,
@@ -130,10 +186,9 @@ def _associate(
             config.min_overlap,
             config.max_speed_difference_px_per_ms if velocity is not None else np.inf,
         )
-        lines.append(line)
-        members.append(member + first[frame])
-    pairs = np.unique(np.stack([np.concatenate(lines), np.concatenate(members)]), axis=1)
-    return LineTracks.from_rows(pairs[0], pairs[1], len(refined))
+        found.append(np.stack([line, member + first[frame]]))
+    line, member = np.concatenate(found, axis=1)
+    return line, member
 
 
 def _lengthened(refined: Refined, views: Views) -> FloatArray:

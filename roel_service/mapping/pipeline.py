@@ -24,16 +24,19 @@ from roel_service.mapping.match_sampled import (
 )
 from roel_service.mapping.merge import merge_duplicates
 from roel_service.mapping.refine import Refined, refine_lines
+from roel_service.mapping.refine_poses import refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.trim import trim_to_segments
-from roel_service.progress import ProgressCallback, ignore
+from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.lines import LineTracks
 from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
 from roel_service.scene.trajectory import Trajectory
 
+# Share of the whole job that refining the poses takes.
+POSES_SHARE = 0.6
 # Below every length: with this cap all observations weigh the same.
 EQUAL_WEIGHTS_PX = 1.0
 
@@ -48,10 +51,12 @@ def build_line_map(
     matcher: LineMatcher | None = None,
     progress: ProgressCallback = ignore,
 ) -> MappingResult:
-    """Reconstruct a 3D line map from events and known poses.
+    """Reconstruct a 3D line map from events and poses.
+
+    With `refine.free_poses` the poses are refined first, and the map is that of the refined ones.
 
     Args:
-        events: read once, front to back.
+        events: read front to back, twice with free poses, else once.
         trajectory: poses on the clock of the events; what they do not cover is left out.
         camera: calibration of the sensor.
         config: parameters of every stage, and the seed.
@@ -64,9 +69,15 @@ def build_line_map(
         ConfigError: the configured matcher lacks its extra or its checkpoint.
         EventsError: no events.
         TrajectoryError: poses that cover less than a tenth of the recording.
+        LimitError, NoAnswerError: as `refine_poses`, with free poses.
         Cancelled: as raised by `progress`.
     """
     run = MappingRun(progress)
+    if config.refine.free_poses:
+        before = part_of(progress, 0.0, POSES_SHARE)
+        poses = refine_poses(events, trajectory, camera, config, progress=before)
+        trajectory = poses.trajectory
+        run = MappingRun(part_of(progress, POSES_SHARE, 1.0), seconds=poses.report.seconds)
     rng = np.random.default_rng(config.runtime.seed)
     counted = CountedEvents(events, trajectory)
     detector = detector or line_detector(config.detect)

@@ -14,13 +14,15 @@ import numpy as np
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import Config
 from roel_service.errors import NoAnswerError
+from roel_service.geometry import plucker
+from roel_service.geometry.alignment import align_poses
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected, lines_of_all_frames
 from roel_service.mapping.joint import JointlyRefined, refine_jointly
-from roel_service.mapping.match_global import reassociate
+from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
 from roel_service.mapping.pose_correction import PoseCorrection
 from roel_service.mapping.refine import Refined, refine_lines
@@ -31,11 +33,15 @@ from roel_service.mapping.views import views_of
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
+from roel_service.scene.lines import InfiniteLines, LineMap
 from roel_service.scene.results import PoseReport, PoseResult
 from roel_service.scene.trajectory import Trajectory
 
 # Fewer lines than this do not hold six unknowns.
 MIN_LINE_COUNT = 6
+# The first gates in a given map are so much wider than those of a recording's own lines: its world
+# and that of the poses need not be quite the same.
+MAP_GATES = (4.0, 2.0)
 # While the gate is wide, residuals up to this share of it count in full.
 FULL_WEIGHT_SHARE = 1.0 / 3.0
 # Beyond the first gate: what noisy poses add between two frames, and over a whole track.
@@ -49,18 +55,20 @@ def refine_poses(
     camera: Camera,
     config: Config,
     *,
+    line_map: LineMap | None = None,
     progress: ProgressCallback = ignore,
 ) -> PoseResult:
-    """Refine the poses of a recording together with the lines that it sees.
+    """Refine the poses of a recording, together with the lines that it sees or in a given map.
 
-    Where the world is, and how large, only the given poses tell: the result is as close to them as
-    the lines allow.
+    Without a map only the given poses tell where the world is: the result is aligned to them, and
+    as large as they are.
 
     Args:
         events: read once, front to back.
         trajectory: poses on the clock of the events.
         camera: calibration of the sensor.
-        config: parameters of every stage; those of free poses are in `refine`.
+        config: parameters of every stage; those of the poses are in `refine`.
+        line_map: lines that stay as they are; the given poses are roughly those in its world.
         progress: called often; may raise `Cancelled`.
 
     Raises:
@@ -77,16 +85,17 @@ def refine_poses(
     detector = line_detector(config.detect)
     detected = lines_of_all_frames(counted, smooth, camera, config, detector, run)
     counted.check_coverage()
-    refined = _first_lines(detected, config, run)
-    found: list[JointlyRefined] = []
-    for gate_px in config.refine.pose_gates_px:
-        refined, joint = _round(refined, correction, detected, smooth, config, gate_px, run)
-        correction = joint.correction
-        found.append(joint)
+    if line_map is None:
+        refined, found = _with_own_lines(detected, smooth, correction, config, run)
+    else:
+        refined, found = _in_map(line_map, detected, smooth, correction, config, run)
     observation_count = len(refined.tracks.observation)
     noise_px = config.refine.pose_noise_px
+    poses = found[-1].correction.trajectory(smooth).T_world_camera
+    if line_map is None:
+        poses = align_poses(poses, trajectory.T_world_camera) @ poses
     return PoseResult(
-        trajectory=correction.trajectory(smooth),
+        trajectory=Trajectory(t_us=trajectory.t_us, T_world_camera=poses),
         covariance=_covariance(found[-1], trajectory),
         report=PoseReport(
             line_count=len(refined),
@@ -128,46 +137,74 @@ def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined
         )
 
 
-def _round(
-    refined: Refined,
-    correction: PoseCorrection,
+def _with_own_lines(
     detected: Detected,
     smooth: Trajectory,
+    correction: PoseCorrection,
     config: Config,
-    gate_px: float,
     run: MappingRun,
-) -> tuple[Refined, JointlyRefined]:
-    """Match with the poses as they are, then refine lines and poses together."""
-    config = _with_gate(config, gate_px)
-    with run.stage("match_global"):
-        frames, evidence = _seen_with(detected, correction)
-        refined = reassociate(
-            refined,
-            evidence,
-            detected.observations,
-            frames,
-            correction.trajectory(smooth),
-            config,
-            run.step,
-        )
+) -> tuple[Refined, list[JointlyRefined]]:
+    """Rounds of matching with the poses as they are, and of refining lines and poses together."""
+    refined = _first_lines(detected, config, run)
+    found: list[JointlyRefined] = []
+    for gate_px in config.refine.pose_gates_px:
+        gated = _with_gate(config, gate_px)
+        with run.stage("match_global"):
+            frames, evidence = _seen_with(detected, correction)
+            poses = correction.trajectory(smooth)
+            refined = reassociate(
+                refined, evidence, detected.observations, frames, poses, gated, run.step
+            )
+        _check_count(refined)
+        with run.stage("refine"):
+            directions = direction_prior(refined, gated.refine)
+            joint = refine_jointly(refined, correction, detected, gated.refine, directions)
+            correction = joint.correction
+            frames, evidence = _seen_with(detected, correction)
+            refined = run.without_diverged(
+                refine_lines(
+                    joint.lines, refined.tracks, evidence, frames, gated.refine, directions
+                )
+            )
+        found.append(joint)
+    return refined, found
+
+
+def _in_map(
+    line_map: LineMap,
+    detected: Detected,
+    smooth: Trajectory,
+    correction: PoseCorrection,
+    config: Config,
+    run: MappingRun,
+) -> tuple[Refined, list[JointlyRefined]]:
+    """Rounds of matching with the poses as they are, and of refining them alone."""
+    direction, moment = plucker.plucker_from_endpoints(line_map.segments)
+    lines = InfiniteLines(direction=direction, moment=moment)
+    gates_px = config.refine.pose_gates_px
+    found: list[JointlyRefined] = []
+    for gate_px in (*(wider * gates_px[0] for wider in MAP_GATES), *gates_px):
+        gated = _with_gate(config, gate_px)
+        with run.stage("match_global"):
+            frames, evidence = _seen_with(detected, correction)
+            poses = correction.trajectory(smooth)
+            refined = match_fixed_lines(
+                lines, line_map.segments, evidence, detected.observations, frames, poses, gated
+            )
+        _check_count(refined)
+        with run.stage("refine"):
+            joint = refine_jointly(
+                refined, correction, detected, gated.refine, None, free_lines=False
+            )
+            correction = joint.correction
+        found.append(joint)
+    return refined, found
+
+
+def _check_count(refined: Refined) -> None:
     if len(refined) < MIN_LINE_COUNT:
-        raise NoAnswerError("poses", f"at least {MIN_LINE_COUNT} lines", f"{len(refined)}")
-    with run.stage("refine"):
-        directions = direction_prior(refined, config.refine)
-        joint = refine_jointly(
-            refined,
-            correction,
-            detected.observations,
-            evidence,
-            detected.frames,
-            config.refine,
-            directions,
-        )
-        frames, evidence = _seen_with(detected, joint.correction)
-        refined = run.without_diverged(
-            refine_lines(joint.lines, refined.tracks, evidence, frames, config.refine, directions)
-        )
-    return refined, joint
+        expected = f"at least {MIN_LINE_COUNT} lines in view"
+        raise NoAnswerError("poses", expected, f"{len(refined)}", reason="TOO_FEW_LINES")
 
 
 def _with_gate(config: Config, gate_px: float) -> Config:

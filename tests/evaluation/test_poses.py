@@ -5,12 +5,12 @@ from hypothesis import strategies as st
 
 from roel_service.errors import TrajectoryError
 from roel_service.evaluation.poses import (
-    align_points,
     rotation_errors_rad,
     success_rate,
     trajectory_errors,
     translation_errors_m,
 )
+from roel_service.geometry.alignment import align_points
 from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.scene.trajectory import Trajectory
 

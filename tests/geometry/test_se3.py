@@ -172,3 +172,20 @@ def test_constructor_refuses_wrong_shapes_and_values(rotation, translation, name
 def test_arrays_of_a_transform_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         SE3.identity().translation[0] = 1.0
+
+
+@given(arrays((3,), -np.pi, np.pi), st.integers(0, 2))
+def test_jacobian_of_a_rotation_vector_is_its_derivative(vector, axis):
+    step = 1e-6 * np.eye(3)[axis]
+    before, after = rotation_from_vector(vector - step), rotation_from_vector(vector + step)
+    turned = se3.vector_from_rotation(after @ before.T) / 2e-6
+    # Central differences: 1e-12 of the third derivative, and rounding over the step.
+    np.testing.assert_allclose(
+        turned, se3.rotation_vector_jacobian(vector)[:, axis], rtol=0, atol=1e-8
+    )
+
+
+def test_jacobian_of_a_rotation_vector_is_continuous_where_its_series_begins():
+    below, above = np.array([[0.99e-4, 0, 0], [1.01e-4, 0, 0]])
+    difference = se3.rotation_vector_jacobian(above) - se3.rotation_vector_jacobian(below)
+    np.testing.assert_allclose(difference, 0.5 * skew(above - below), rtol=0, atol=1e-9)

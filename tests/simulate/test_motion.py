@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from roel_service.evaluation.poses import align_points
+from roel_service.geometry.alignment import align_points
 from roel_service.geometry.se3 import rotation_angle
 from roel_service.simulate.motion import (
     JITTER_M,

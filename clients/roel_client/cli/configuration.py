@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 
 from roel_client.cli.output import print_text
-from roel_client.cli.parser import Command, Parser, Subparsers, command, command_group, one_of
+from roel_client.cli.parser import (
+    Command,
+    Parser,
+    Subparsers,
+    command,
+    command_group,
+    integer,
+    one_of,
+)
 from roel_client.cli.staging import Staged
 from roel_client.naming import naming
 from roel_service.config.load import Tables, load_config, to_toml
@@ -22,6 +30,11 @@ def add_commands(subparsers: Subparsers) -> None:
     add_config_options(parser)
 
 
+def add_seed_option(parser: Parser) -> None:
+    """`--seed`."""
+    parser.add_argument("--seed", type=integer(0), metavar="N", help="fixes all randomness (0)")
+
+
 def add_config_options(parser: Parser) -> None:
     """The options that choose parameters."""
     parser.add_argument(
@@ -32,6 +45,11 @@ def add_config_options(parser: Parser) -> None:
         help="whole set of parameters: default, or paper for the published one",
     )
     parser.add_argument("--config", metavar="FILE.toml", help="parameters that differ from it")
+
+
+def seed_table(options: argparse.Namespace) -> Tables:
+    """What `--seed` changes of the configuration."""
+    return {} if options.seed is None else {"runtime": {"seed": options.seed}}
 
 
 def effective_config(options: argparse.Namespace, overrides: Tables | None = None) -> Config:

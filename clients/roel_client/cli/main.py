@@ -19,6 +19,7 @@ from roel_client.cli import (
     evaluate,
     health,
     maps,
+    poses,
     register,
     serve,
     simulate,
@@ -141,6 +142,7 @@ def parser() -> Parser:
     for group in (
         maps,
         register,
+        poses,
         evaluate,
         simulate,
         bench,

@@ -7,21 +7,27 @@ import time
 from pathlib import Path
 from typing import Any
 
-from roel_client.cli.configuration import add_config_options, effective_config
+from roel_client.cli.configuration import (
+    add_config_options,
+    add_seed_option,
+    effective_config,
+    seed_table,
+)
 from roel_client.cli.output import print_result, progress_bar, to_json
 from roel_client.cli.parser import (
     Command,
     Parser,
     Subparsers,
+    UsageError,
     command,
     command_group,
-    integer,
     size,
     suffixed,
 )
 from roel_client.cli.process import interruptible
 from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
+from roel_service.config.load import Tables
 
 EXPORT_SUFFIXES = (".npz", ".ply", ".obj", ".json", ".csv", ".dxf")
 
@@ -38,12 +44,18 @@ def _add_build(group: Subparsers) -> None:
     build = Command(
         run=build_map,
         inputs=("events", "poses", "camera", "config"),
-        outputs=("out", "report", "plot"),
+        outputs=("out", "poses_out", "report", "plot"),
     )
     parser = command(group, "build", "build a map from events and camera poses", build)
     add_recording_options(parser)
     parser.add_argument("--out", required=True, metavar="MAP.rlm", help="the map")
     add_config_options(parser)
+    parser.add_argument(
+        "--refine-poses", action="store_true", help="refine the poses together with the lines"
+    )
+    parser.add_argument(
+        "--poses-out", metavar="FILE", help="the refined poses as TUM text (with --refine-poses)"
+    )
     parser.add_argument("--report", metavar="FILE.json", help="how the build went")
     parser.add_argument(
         "--plot",
@@ -51,7 +63,7 @@ def _add_build(group: Subparsers) -> None:
         metavar="FILE.png",
         help="the map over the events and from above",
     )
-    parser.add_argument("--seed", type=integer(0), metavar="N", help="fixes all randomness (0)")
+    add_seed_option(parser)
     add_server_options(parser, required=False, what="let this server build the map")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
 
@@ -77,8 +89,9 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
     from roel_client import local
 
     started_s = time.perf_counter()
-    seed = {} if options.seed is None else {"runtime": {"seed": options.seed}}
-    config = effective_config(options, seed)
+    if options.poses_out is not None:
+        _check_poses_out(options)
+    config = effective_config(options, {**seed_table(options), **poses_table(options)})
     recording = local.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
     )
@@ -92,12 +105,26 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
                     recording, config, progress, options.server, server_options(options)
                 )
     staged["out"].write_bytes(built.rlm_bytes)
+    if "poses_out" in staged:
+        local.write_poses(built.trajectory or recording.trajectory, staged["poses_out"])
     report = {**built.report, "seconds_total": time.perf_counter() - started_s}
     if "report" in staged:
         staged["report"].write_text(to_json(report) + "\n", encoding="utf-8")
     if "plot" in staged:
         local.draw_map(built, recording, staged["plot"])
     print_result(report, _told(report, options.out), as_json=options.json)
+
+
+def _check_poses_out(options: argparse.Namespace) -> None:
+    if not options.refine_poses:
+        raise UsageError("--poses-out", "--refine-poses beside it", options.poses_out)
+    if options.server is not None:
+        raise UsageError("--poses-out", "no --server beside it", f"--server {options.server}")
+
+
+def poses_table(options: argparse.Namespace) -> Tables:
+    """What `--refine-poses` changes of the configuration."""
+    return {"refine": {"free_poses": True}} if options.refine_poses else {}
 
 
 def _told(report: dict[str, Any], out: str) -> str:

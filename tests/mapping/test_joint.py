@@ -1,0 +1,189 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from roel_service.config.stages import RefineConfig
+from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
+from roel_service.geometry import plucker
+from roel_service.geometry.alignment import align_points
+from roel_service.geometry.se3 import SE3
+from roel_service.mapping.front_end import Detected
+from roel_service.mapping.joint import _Problem, _State, refine_jointly
+from roel_service.mapping.pose_correction import PoseCorrection
+from roel_service.mapping.refine import OrthonormalLines, refine_lines
+
+from .synthetic import line_errors, perturbed, trajectory, world
+
+INTERVAL_US = 200_000
+# Poses that may be anywhere, and exact observations.
+CONFIG = RefineConfig(
+    pose_iteration_count=15,
+    pose_interval_us=INTERVAL_US,
+    pose_noise_px=0.01,
+    pose_drift_deg=2.0,
+    pose_drift_m=0.05,
+    max_residual_px=20.0,
+)
+
+
+def error(seed=0, size_rad=0.004, size_m=0.006):
+    """Something wrong with the poses that a correction can undo."""
+    none = PoseCorrection.none(trajectory(), INTERVAL_US)
+    rng = np.random.default_rng(seed)
+    control = rng.normal(size=(len(none), 6)) * ([size_rad] * 3 + [size_m] * 3)
+    return none.stepped(control)
+
+
+def seen(world, wrong=None):
+    """What is detected, with poses that are off."""
+    frames = world.frames
+    if wrong is not None:
+        poses = wrong.applied(frames.t_us, frames.T_world_camera)
+        frames = dataclasses.replace(frames, T_world_camera=poses)
+    return Detected(
+        frames=frames,
+        observations=world.observations,
+        evidence=world.evidence(CONFIG),
+        images={},
+    )
+
+
+def lines_of(world, detected, lines=None):
+    """Lines with their tracks, as they are."""
+    stay = dataclasses.replace(CONFIG, iteration_count=0)
+    return refine_lines(
+        world.lines if lines is None else lines,
+        world.tracks,
+        detected.evidence,
+        detected.frames,
+        stay,
+    )
+
+
+def corrected(found, detected):
+    return found.correction.applied(detected.frames.t_us, detected.frames.T_world_camera)
+
+
+def aligned_errors(poses, truth):
+    """Errors after the best similarity: what lines cannot tell is left out."""
+    fit = align_points(poses.translation, truth.translation, with_scale=True)
+    moved = SE3(
+        rotation=fit.T_target_source.rotation @ poses.rotation,
+        translation=fit.apply(poses.translation),
+    )
+    return translation_errors_m(moved, truth), rotation_errors_rad(moved, truth)
+
+
+class TestRecovery:
+    @pytest.mark.parametrize("seed", [0, 1])
+    def test_lines_and_poses_are_found_together(self, seed):
+        exact = world()
+        detected = seen(exact, error(seed))
+        start = lines_of(exact, detected, perturbed(exact.lines, 0.01, 0.01))
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        found = refine_jointly(start, none, detected, CONFIG, None)
+        truth = exact.frames.T_world_camera
+        before_m, before_rad = aligned_errors(detected.frames.T_world_camera, truth)
+        after_m, after_rad = aligned_errors(corrected(found, detected), truth)
+        # What is left is the pull of the prior along what the lines hardly tell.
+        assert after_m.mean() < 0.1 * before_m.mean()
+        assert after_rad.mean() < 0.1 * before_rad.mean()
+        assert (np.diff(found.costs) <= 0.0).all()
+
+    def test_poses_are_found_among_lines_that_stay(self):
+        exact = world()
+        detected = seen(exact, error())
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        start = lines_of(exact, detected)
+        found = refine_jointly(start, none, detected, CONFIG, None, free_lines=False)
+        truth = exact.frames.T_world_camera
+        # The correction is one of tangents, which do not quite add up: 1e-2 rad squared.
+        assert translation_errors_m(corrected(found, detected), truth).max() < 2e-4
+        assert rotation_errors_rad(corrected(found, detected), truth).max() < 1e-4
+        np.testing.assert_allclose(found.lines.moment, exact.lines.moment, atol=1e-12)
+
+    def test_the_truth_stays_where_it_is(self):
+        exact = world()
+        detected = seen(exact)
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        found = refine_jointly(lines_of(exact, detected), none, detected, CONFIG, None)
+        assert np.abs(found.correction.control).max() < 1e-6
+        assert line_errors(found.lines, exact.segments).max() < 3e-6
+
+    def test_no_steps_leave_everything(self):
+        exact = world()
+        detected = seen(exact, error())
+        still = dataclasses.replace(CONFIG, pose_iteration_count=0)
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        found = refine_jointly(lines_of(exact, detected), none, detected, still, None)
+        assert not found.correction.control.any()
+        assert not found.converged
+
+
+class TestGradient:
+    """The gradients are those of half the cost."""
+
+    @pytest.mark.parametrize("scale", [1.0, 100.0])
+    def test_they_agree_with_central_differences(self, scale):
+        noisy = world(scale, noise_px=0.5, event_noise_px=0.5)
+        detected = seen(noisy)
+        start = lines_of(noisy, detected)
+        wrong = PoseCorrection.none(trajectory(), INTERVAL_US)
+        rng = np.random.default_rng(0)
+        spread = [0.003] * 3 + [0.003 * scale] * 3
+        wrong = wrong.stepped(rng.normal(size=(len(wrong), 6)) * spread)
+        config = dataclasses.replace(CONFIG, pose_drift_m=0.05 * scale)
+        problem = _Problem(start, wrong, detected, config, None, free_lines=True)
+        moment = plucker.shift_origin(start.lines.direction, start.lines.moment, problem.origin)
+        U, phi = plucker.orthonormal_from_plucker(start.lines.direction, moment)
+        state = _State(lines=OrthonormalLines(U=U, phi=phi), correction=wrong)
+        weight = rng.uniform(0.1, 1.0, len(problem.line))
+        system = problem.system(state, weight)
+        assert problem.cost(state, weight) == pytest.approx(system.cost, rel=1e-12)
+
+        def cost(line_step, control_step):
+            moved = plucker.retract_orthonormal(U, phi, line_step)
+            lines = OrthonormalLines(U=moved[0], phi=moved[1])
+            stepped = _State(lines=lines, correction=wrong.stepped(control_step))
+            return problem.cost(stepped, weight)
+
+        no_line, no_control = np.zeros((len(phi), 4)), np.zeros((len(wrong), 6))
+        gradient = 2.0 * system.control_gradient.reshape(-1, 6)
+        for axis in range(6):
+            size = 1e-6 * (scale if axis >= 3 else 1.0)
+            step = no_control.copy()
+            step[4, axis] = size
+            numeric = (cost(no_line, step) - cost(no_line, -step)) / (2 * size)
+            largest = np.abs(gradient[:, axis]).max()
+            assert numeric == pytest.approx(gradient[4, axis], abs=1e-4 * largest)
+        for axis in range(3):
+            step = no_line.copy()
+            step[2, axis] = 1e-6
+            numeric = (cost(step, no_control) - cost(-step, no_control)) / 2e-6
+            by_line = 2.0 * system.line_gradient
+            assert numeric == pytest.approx(by_line[2, axis], abs=1e-4 * np.abs(by_line[2]).max())
+
+    def test_elimination_solves_the_whole_system(self):
+        noisy = world(noise_px=0.5, event_noise_px=0.5)
+        detected = seen(noisy, error())
+        start = lines_of(noisy, detected)
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        problem = _Problem(start, none, detected, CONFIG, None, free_lines=True)
+        state = problem.first_state(start.lines, none)
+        system = problem.system(state, problem.weight(state, loose=True))
+        line_count, size = len(start), 6 * len(none)
+        whole = np.zeros((4 * line_count + size, 4 * line_count + size))
+        for line in range(line_count):
+            at = slice(4 * line, 4 * line + 4)
+            whole[at, at] = system.line_hessian[line]
+        for lines, blocks in problem._blocks(system):
+            whole[4 * lines.start : 4 * lines.stop, 4 * line_count :] = blocks.reshape(-1, size)
+        whole[4 * line_count :, : 4 * line_count] = whole[: 4 * line_count, 4 * line_count :].T
+        whole[4 * line_count :, 4 * line_count :] = system.control_hessian
+        gradient = np.concatenate([system.line_gradient.ravel(), system.control_gradient])
+        step = -np.linalg.solve(whole, gradient)[4 * line_count :]
+        moved = problem.step(state, system, 0.0)
+        np.testing.assert_allclose(
+            moved.correction.control.ravel(), step, atol=1e-5 * np.abs(step).max()
+        )

@@ -1,0 +1,71 @@
+import numpy as np
+import pytest
+
+from roel_service.config.stages import RefineConfig
+from roel_service.errors import LimitError
+from roel_service.mapping.pose_correction import PoseCorrection, drift_information
+
+from .synthetic import DURATION_US, trajectory
+
+INTERVAL_US = 100_000
+
+
+def correction(control=None):
+    none = PoseCorrection.none(trajectory(), INTERVAL_US)
+    return none if control is None else none.stepped(control)
+
+
+def test_no_correction_changes_nothing():
+    given = trajectory()
+    found = correction().trajectory(given)
+    np.testing.assert_array_equal(found.t_us, given.t_us)
+    np.testing.assert_allclose(found.T_world_camera.matrix(), given.T_world_camera.matrix())
+
+
+def test_control_points_cover_the_trajectory_and_are_close_enough():
+    found = correction()
+    assert found.interval_us <= INTERVAL_US
+    assert len(found) == DURATION_US // INTERVAL_US + 3
+
+
+def test_shares_are_a_partition_of_one_without_negative_parts():
+    shares = correction().shares(trajectory().t_us)
+    assert shares.min() > -1e-12
+    np.testing.assert_allclose(shares.sum(axis=1), 1.0, atol=1e-12)
+
+
+def test_straight_control_points_give_a_straight_correction():
+    found = correction()
+    centre_us = found.first_us + (np.arange(len(found)) - 1) * found.interval_us
+    moved = found.stepped(np.outer(centre_us * 1e-6, [0, 0, 0, 1, 2, 3]))
+    t_us = trajectory().t_us
+    shift = moved.shares(t_us) @ moved.control
+    np.testing.assert_allclose(shift[:, 3:], np.outer(t_us * 1e-6, [1, 2, 3]), atol=1e-12)
+
+
+def test_the_correction_has_no_jumps():
+    rng = np.random.default_rng(0)
+    moved = correction(rng.normal(size=(len(correction()), 6)))
+    around_us = np.arange(INTERVAL_US - 2, INTERVAL_US + 3)
+    steps = np.diff(moved.shares(around_us) @ moved.control, axis=0)
+    # Twice differentiable: over a microsecond the step changes by 1e-10 of the control points.
+    np.testing.assert_allclose(steps, steps[[0]].repeat(4, axis=0), atol=1e-8)
+
+
+def test_drift_is_that_of_an_odometry_that_forgets():
+    config = RefineConfig(pose_drift_deg=0.5, pose_drift_m=0.02, pose_drift_s=0.7)
+    found = correction()
+    covariance = np.linalg.inv(drift_information(found, config))
+    count = len(found)
+    apart_s = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) * found.interval_us
+    expected = np.exp(-apart_s * 1e-6 / 0.7)
+    by_time = covariance.reshape(count, 6, count, 6)
+    np.testing.assert_allclose(by_time[:, 0, :, 0], np.deg2rad(0.5) ** 2 * expected, atol=1e-12)
+    np.testing.assert_allclose(by_time[:, 5, :, 5], 0.02**2 * expected, atol=1e-12)
+    assert not by_time[:, 0, :, 1].any()
+
+
+def test_too_long_a_recording_is_refused():
+    with pytest.raises(LimitError, match=r"at most 1 s at refine\.pose_interval_us") as caught:
+        PoseCorrection.none(trajectory(), 1_000)
+    assert caught.value.reason == "RECORDING_TOO_LONG"

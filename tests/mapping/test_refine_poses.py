@@ -1,0 +1,123 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from roel_service.errors import Cancelled, LimitError, NoAnswerError
+from roel_service.evaluation.poses import trajectory_errors
+from roel_service.mapping.pipeline import build_line_map
+from roel_service.mapping.refine_poses import refine_poses
+from roel_service.scene.lines import LineMap
+from roel_service.scene.trajectory import Trajectory
+
+from .synthetic import CAMERA, SEGMENTS_WORLD, event_stream, trajectory
+from .test_pipeline import CONFIG
+
+# Half as far off in pixels, with an image a quarter as wide as those that the defaults are for.
+JITTER_M, JITTER_RAD = 0.002, 0.001
+DRIFT_M, DRIFT_RAD = 0.006, 0.003
+
+
+def noisy_trajectory(seed=0):
+    """Jitter, and a drift that swings once a second."""
+    truth = trajectory()
+    rng = np.random.default_rng(seed)
+    jitter = rng.normal(size=(len(truth), 6)) * ([JITTER_RAD] * 3 + [JITTER_M] * 3)
+    phase = 2 * np.pi * truth.t_us[:, None] * 1e-6 + rng.uniform(0, 2 * np.pi, 6)
+    drift = np.sin(phase) * ([DRIFT_RAD] * 3 + [DRIFT_M] * 3)
+    poses = truth.T_world_camera.retract(jitter + drift)
+    return Trajectory(t_us=truth.t_us, T_world_camera=poses)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    return noisy_trajectory()
+
+
+@pytest.fixture(scope="module")
+def found(noisy):
+    return refine_poses(event_stream(), noisy, CAMERA, CONFIG)
+
+
+class TestTogetherWithTheLines:
+    def test_poses_get_better(self, noisy, found):
+        before = trajectory_errors(noisy, trajectory())
+        after = trajectory_errors(found.trajectory, trajectory())
+        # Lines of 160 px images hold rotations to some 0.3 px of 120 px focal length.
+        assert after.ate_rmse_m < 0.7 * before.ate_rmse_m
+        assert after.rotation_rms_deg < 0.7 * before.rotation_rms_deg
+        np.testing.assert_array_equal(found.trajectory.t_us, noisy.t_us)
+
+    def test_the_report_tells_what_was_done(self, noisy, found):
+        report = found.report
+        assert 6 <= report.line_count <= 3 * len(SEGMENTS_WORLD)
+        assert report.cost_final < report.cost_initial
+        assert report.iteration_count >= len(CONFIG.refine.pose_gates_px)
+        assert report.seconds["refine"] > 0.0
+        assert found.covariance.shape == (len(noisy), 6, 6)
+        assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+
+    def test_the_result_is_aligned_to_the_given_poses(self, noisy, found):
+        shift = found.trajectory.T_world_camera.translation - noisy.T_world_camera.translation
+        np.testing.assert_allclose(shift.mean(axis=0), 0.0, atol=1e-9)
+
+    def test_good_poses_are_not_harmed(self):
+        found = refine_poses(event_stream(), trajectory(), CAMERA, CONFIG)
+        # A tenth of a pixel at 2 m; the events themselves are a pixel wide.
+        assert trajectory_errors(found.trajectory, trajectory()).ate_rmse_m < 0.002
+
+    def test_a_map_with_free_poses_is_that_of_the_refined_ones(self, noisy, found):
+        free = dataclasses.replace(
+            CONFIG, refine=dataclasses.replace(CONFIG.refine, free_poses=True)
+        )
+        fractions = []
+        built = build_line_map(
+            event_stream(),
+            noisy,
+            CAMERA,
+            free,
+            progress=lambda step: fractions.append(step.fraction),
+        )
+        np.testing.assert_array_equal(
+            built.trajectory.T_world_camera.matrix(), found.trajectory.T_world_camera.matrix()
+        )
+        again = build_line_map(event_stream(), found.trajectory, CAMERA, CONFIG)
+        np.testing.assert_array_equal(built.line_map.segments, again.line_map.segments)
+        assert fractions == sorted(fractions)
+        assert built.report.seconds["refine"] > again.report.seconds["refine"]
+
+
+class TestInAMap:
+    def test_poses_find_their_place(self, noisy):
+        line_map = LineMap.from_segments(SEGMENTS_WORLD)
+        found = refine_poses(event_stream(), noisy, CAMERA, CONFIG, line_map=line_map)
+        given, after = (
+            np.linalg.norm(
+                poses.T_world_camera.translation - trajectory().T_world_camera.translation, axis=1
+            )
+            for poses in (noisy, found.trajectory)
+        )
+        # A pixel is 17 mm wide at 2 m; the given poses were off by 8 mm.
+        assert after.mean() < 0.75 * given.mean()
+
+    def test_a_map_out_of_view_holds_nothing(self, noisy):
+        line_map = LineMap.from_segments(SEGMENTS_WORLD - np.array([0.0, 0.0, 100.0]))
+        with pytest.raises(NoAnswerError, match="at least 6 lines in view, found 0") as caught:
+            refine_poses(event_stream(), noisy, CAMERA, CONFIG, line_map=line_map)
+        assert caught.value.reason == "TOO_FEW_LINES"
+
+
+def test_too_many_control_points_are_refused_before_any_work(noisy):
+    fine = dataclasses.replace(
+        CONFIG, refine=dataclasses.replace(CONFIG.refine, pose_interval_us=1_000)
+    )
+    with pytest.raises(LimitError, match="poses to refine"):
+        refine_poses(event_stream(), noisy, CAMERA, fine)
+
+
+def test_it_can_be_cancelled(noisy):
+    def cancel(progress):
+        raise Cancelled
+
+    with pytest.raises(Cancelled):
+        refine_poses(event_stream(), noisy, CAMERA, CONFIG, progress=cancel)
