@@ -109,7 +109,11 @@ _ROWS = (
     Reason("TLS_INVALID", InputError, "files that are no certificate and its key"),
     Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
     Reason("DATA_UNSOUND", NoAnswerError, "a data folder in which a check found problems"),
-    Reason("TOO_FEW_LINES", NoAnswerError, "a map of fewer than three lines"),
+    Reason(
+        "TOO_FEW_LINES",
+        NoAnswerError,
+        "a map of fewer than three lines, or too few lines in view to hold poses",
+    ),
     Reason("NOT_REGISTERED", NoAnswerError, "a registration not to be relied on, with `--strict`"),
     Reason("NOT_FOUND", NotFoundError, "a resource that does not exist"),
     Reason(
@@ -142,6 +146,7 @@ _ROWS = (
     ),
     Reason("WRITER_REPLACED", ConflictError, "an upload that another one took over"),
     Reason("LIMIT_EXCEEDED", LimitError, "something too large, for no reason listed below"),
+    Reason("RECORDING_TOO_LONG", LimitError, "more poses than are refined at once"),
     Reason("EVENT_STREAM_TOO_LARGE", LimitError, "a recording beyond the server's limit"),
     Reason("CREDIT_EXCEEDED", LimitError, "an upload that does not wait for acknowledgements"),
     Reason(

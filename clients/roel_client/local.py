@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.lines import LineMap
-    from roel_service.scene.results import PoseResult, RegistrationResult
+    from roel_service.scene.results import RegistrationResult
     from roel_service.scene.trajectory import Trajectory
     from roel_service.wire.rlm import MapFile
 
@@ -129,19 +129,30 @@ def write_poses(trajectory: Trajectory, path: Path) -> None:
 
 
 def refine_poses(
-    recording: Recording, map_name: str | None, config: Config, progress: ProgressCallback
-) -> PoseResult:
-    """Refine the poses of a recording, with its own lines or against those of a map.
+    recording: Recording,
+    map_name: str | None,
+    config: Config,
+    out: Path,
+    progress: ProgressCallback,
+) -> dict[str, Any]:
+    """Refine the poses of a recording, with its own lines or in a map, and write them.
+
+    Returns:
+        What `roel refine-poses` prints.
 
     Raises:
         NoAnswerError: too few lines.
         RoelError: whatever reading and refining raise.
     """
+    import numpy as np
+
+    from roel_service.geometry.se3 import rotation_angle
     from roel_service.mapping import refine_poses as poses
 
+    started_s = time.perf_counter()
     line_map = None if map_name is None else _read_map(map_name)
     with naming(recording.names):
-        return poses.refine_poses(
+        found = poses.refine_poses(
             recording.events,
             recording.trajectory,
             recording.camera,
@@ -149,6 +160,21 @@ def refine_poses(
             line_map=line_map,
             progress=progress,
         )
+    write_poses(found.trajectory, out)
+    before, after = recording.trajectory.T_world_camera, found.trajectory.T_world_camera
+    shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
+    turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+    return {
+        "pose_count": len(found.trajectory),
+        "line_count": found.report.line_count,
+        "iterations": found.report.iteration_count,
+        "converged": found.report.converged,
+        "cost_initial": found.report.cost_initial,
+        "cost_final": found.report.cost_final,
+        "mean_shift_m": float(shift_m.mean()),
+        "mean_turn_deg": float(np.degrees(turn_rad).mean()),
+        "seconds": time.perf_counter() - started_s,
+    }
 
 
 def read_map_file(name: str) -> MapFile:

@@ -154,10 +154,10 @@ def _mirror(add: RoundBuilder, wall: Wall, along_m: float, rng: np.random.Genera
     radius_m, up_m = rng.uniform(0.2, 0.38), rng.uniform(1.35, 1.7)
     frame, glass = add.plain(rng.uniform(0.05, 0.3, 3)), add.plain(rng.uniform(0.6, 0.95, 3))
     # Turning left as seen from inside.
-    axes = {"right": -wall.right, "up": UP}
-    back = add.rim(circle(wall.at(along_m, up_m, 0.0), radius_m, **axes))
-    front = add.rim(circle(wall.at(along_m, up_m, 0.03), radius_m, **axes))
-    inner = add.rim(circle(wall.at(along_m, up_m, 0.03), 0.8 * radius_m, **axes))
+    right = -wall.right
+    back = add.rim(circle(wall.at(along_m, up_m, 0.0), radius_m, right=right, up=UP))
+    front = add.rim(circle(wall.at(along_m, up_m, 0.03), radius_m, right=right, up=UP))
+    inner = add.rim(circle(wall.at(along_m, up_m, 0.03), 0.8 * radius_m, right=right, up=UP))
     add.band(back, front, frame)
     add.band(front, inner, frame)
     add.disc(wall.at(along_m, up_m, 0.03), inner, glass)

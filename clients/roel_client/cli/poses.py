@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import time
 from typing import Any
-
-import numpy as np
 
 from roel_client.cli.configuration import (
     add_config_options,
@@ -18,9 +15,6 @@ from roel_client.cli.maps import add_recording_options
 from roel_client.cli.output import print_result, progress_bar
 from roel_client.cli.parser import Command, Subparsers, command
 from roel_client.cli.staging import Staged
-from roel_service.geometry.se3 import rotation_angle
-from roel_service.scene.results import PoseResult
-from roel_service.scene.trajectory import Trajectory
 
 
 def add_commands(subparsers: Subparsers) -> None:
@@ -41,33 +35,13 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Refine the poses of a recording, and write them at their own times."""
     from roel_client import local
 
-    started_s = time.perf_counter()
     config = effective_config(options, seed_table(options))
     recording = local.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
-        found = local.refine_poses(recording, options.map, config, progress)
-    local.write_poses(found.trajectory, staged["out"])
-    result = _result(found, recording.trajectory, time.perf_counter() - started_s)
+        result = local.refine_poses(recording, options.map, config, staged["out"], progress)
     print_result(result, _told(result, options.out), as_json=options.json)
-
-
-def _result(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, Any]:
-    before, after = given.T_world_camera, found.trajectory.T_world_camera
-    shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
-    turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
-    return {
-        "pose_count": len(given),
-        "line_count": found.report.line_count,
-        "iterations": found.report.iteration_count,
-        "converged": found.report.converged,
-        "cost_initial": found.report.cost_initial,
-        "cost_final": found.report.cost_final,
-        "mean_shift_m": float(shift_m.mean()),
-        "mean_turn_deg": float(np.degrees(turn_rad).mean()),
-        "seconds": seconds,
-    }
 
 
 def _told(result: dict[str, Any], out: str) -> str:
