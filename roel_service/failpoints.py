@@ -28,7 +28,6 @@ FAILPOINTS = (
     "task.leased",
     "task.previewed",
     "task.ended",
-    "stage.cached",
     "sweep.deleted",
 )
 

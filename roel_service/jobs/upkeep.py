@@ -13,10 +13,15 @@ logger = logging.getLogger(__name__)
 
 
 @asynccontextmanager
-async def upkeep(store: Store, interval_s: float) -> AsyncIterator[None]:
-    """Collect garbage at intervals while the block runs; none is under way when it has ended."""
+async def upkeep(store: Store, interval_s: float, unused_for_s: float) -> AsyncIterator[None]:
+    """Collect garbage at intervals while the block runs; none is under way when it has ended.
+
+    Args:
+        interval_s: between two collections.
+        unused_for_s: files that nobody names stay for so long; longer than any upload.
+    """
     ended = asyncio.Event()
-    sweeping = asyncio.create_task(_sweep_until(ended, store, interval_s))
+    sweeping = asyncio.create_task(_sweep_until(ended, store, interval_s, unused_for_s))
     try:
         yield
     finally:
@@ -24,9 +29,11 @@ async def upkeep(store: Store, interval_s: float) -> AsyncIterator[None]:
         await sweeping
 
 
-async def _sweep_until(ended: asyncio.Event, store: Store, interval_s: float) -> None:
+async def _sweep_until(
+    ended: asyncio.Event, store: Store, interval_s: float, unused_for_s: float
+) -> None:
     while not await _is_set_within(ended, interval_s):
-        swept = await asyncio.to_thread(store.collect_garbage)
+        swept = await asyncio.to_thread(store.collect_garbage, unused_for_s)
         logger.info("deleted %d files, kept %d", swept.deleted_blob_count, swept.kept_blob_count)
 
 

@@ -118,7 +118,7 @@ async def running(
             admin = await resources.enter_async_context(admin_server(*listen.admin, probes))
         await server.start()
         try:
-            async with upkeep(store, settings.sweep_interval_s):
+            async with upkeep(store, settings.sweep_interval_s, settings.longest_upload_s):
                 yield Addresses(calls=address, admin=admin)
         finally:
             logger.info("draining")

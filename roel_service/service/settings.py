@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from roel_service.service.paging import MAX_PAGE_SIZE
 from roel_service.store import retention
+from roel_service.store.garbage import LONGEST_UPLOAD_S
 from roel_service.wire.chunks import MAX_CHUNK_EVENT_COUNT
 from roel_service.wire.rlm import MAX_LINE_COUNT
 
@@ -35,6 +36,7 @@ class Settings:
         commit_interval_s, commit_bytes: what an upload sent is made durable when its first part is
             this old, or when it is this much.
         sweep_interval_s: time between two collections of garbage.
+        longest_upload_s: files that nobody names are no garbage before.
         download_part_bytes: size of the messages of a download.
         lines_per_message: most lines of a message of GetLines.
         label_count: most labels of a resource.
@@ -66,6 +68,7 @@ class Settings:
     upload_silence_s: float = 60.0
     commit_interval_s: float = 0.02
     sweep_interval_s: float = 3600.0
+    longest_upload_s: float = LONGEST_UPLOAD_S
     commit_bytes: int = 8 * MIB
     download_part_bytes: int = MIB
     lines_per_message: int = 100_000

@@ -11,7 +11,7 @@ def test_garbage_goes_by_itself(tmp_path):
         os.utime(store._blobs.path(old), (0, 0))
 
         async def scenario():
-            async with upkeep(store, interval_s=0.01), asyncio.timeout(30):
+            async with upkeep(store, interval_s=0.01, unused_for_s=60.0), asyncio.timeout(30):
                 while store._blobs.path(old).exists():
                     await asyncio.sleep(0.01)
 

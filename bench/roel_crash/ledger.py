@@ -1,0 +1,80 @@
+"""What the server acknowledged, and whether it still holds."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from dataclasses import dataclass, field
+
+from roel_client import Client
+from roel_service.errors import NotFoundError, RoelError
+from roel_service.v1 import events_pb2, maps_pb2
+
+
+@dataclass
+class Ledger:
+    """Facts by resource name; safe between threads.
+
+    Attributes:
+        events: recording to events acknowledged.
+        digests: frozen recording to its digest.
+        maps: version to the digest of its map file.
+        ends: operation to how it ended.
+        broken: promises that were not kept, one line each.
+    """
+
+    events: dict[str, int] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)
+    maps: dict[str, str] = field(default_factory=dict)
+    ends: dict[str, str] = field(default_factory=dict)
+    broken: list[str] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def note_events(self, stream: str, event_count: int) -> None:
+        """So many events are durable."""
+        with self._lock:
+            self.events[stream] = max(event_count, self.events.get(stream, 0))
+
+    def note_frozen(self, stream: events_pb2.EventStream) -> None:
+        """A recording is frozen."""
+        with self._lock:
+            self.digests[stream.name] = stream.digest
+
+    def note_map(self, version: maps_pb2.MapVersion) -> None:
+        """A version is complete."""
+        with self._lock:
+            self.maps[version.name] = version.map.sha256
+
+    def note_end(self, operation: str, end: str) -> None:
+        """An operation has ended; it must never be told to have ended otherwise."""
+        with self._lock:
+            if self.ends.setdefault(operation, end) != end:
+                self.broken.append(f"{operation} ended as {self.ends[operation]} and as {end}")
+
+    def check(self, client: Client) -> None:
+        """Ask a server for everything; what it does not know any more is a broken promise."""
+        with self._lock:
+            events, digests, maps = dict(self.events), dict(self.digests), dict(self.maps)
+        for name, event_count in events.items():
+            self._expect(name, event_count <= self._found(client, name).event_count, "lost events")
+        for name, digest in digests.items():
+            self._expect(name, digest == self._found(client, name).digest, "another digest")
+        for name, sha256 in maps.items():
+            found = hashlib.sha256(client.download_map(name)).hexdigest()
+            self._expect(name, found == sha256, "another map")
+
+    def _found(self, client: Client, name: str) -> events_pb2.EventStream:
+        try:
+            return client.event_stream(name)
+        except NotFoundError:
+            return events_pb2.EventStream()
+
+    def _expect(self, name: str, is_kept: bool, problem: str) -> None:
+        if not is_kept:
+            with self._lock:
+                self.broken.append(f"{name}: {problem}")
+
+
+def end_of(error: RoelError) -> str:
+    """How an operation ended that failed."""
+    return f"{type(error).__name__} {error.reason}"

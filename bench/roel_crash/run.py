@@ -1,0 +1,177 @@
+"""Kill after kill, with a check after each."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import IO, Any
+
+from roel_client import Client, RetryPolicy
+from roel_crash.checker import Checker
+from roel_crash.ledger import Ledger
+from roel_crash.victim import Victim
+from roel_service.failpoints import FAILPOINTS
+from roel_service.store.fsck import check_folder
+from roel_service.store.records import OperationState
+from roel_service.store.store import Store
+
+# A named step that is not met within this time is not part of what the checkers do just then.
+STEP_TIMEOUT_S = 15.0
+# Steps that are met at every start; now and then one is survived.
+STEPS_OF_STARTS = ("rows.written", "rows.committed")
+LONGEST_LIFE_S = 2.5
+
+CHECKER_COUNT = 2
+
+# Connections of one process share how long they wait before they try again: up to some seconds.
+PATIENT = RetryPolicy(attempt_count=30, longest_pause_s=1.0)
+
+
+@dataclass
+class Outcome:
+    """What came of it.
+
+    Attributes:
+        kills: by what was killed, and where.
+        broken: promises that were not kept; problems that a check of the folder found.
+    """
+
+    seed: int
+    kills: Counter[str] = field(default_factory=Counter)
+    broken: list[str] = field(default_factory=list)
+    ends: Counter[str] = field(default_factory=Counter)
+    event_count: int = 0
+    recording_count: int = 0
+    map_count: int = 0
+    longest_restart_s: float = 0.0
+    seconds: float = 0.0
+
+    def document(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        return {**asdict(self), "kill_count": self.kills.total()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Kill:
+    """One kill.
+
+    Attributes:
+        name: what is counted.
+        failpoint: for the server's environment; empty for a kill from outside.
+    """
+
+    name: str
+    failpoint: str
+    strike: Callable[[Victim], bool]
+
+
+def plan(kill_count: int, rng: random.Random) -> Iterator[Kill]:
+    """Servers at random moments and at every named step in turn, and children.
+
+    A named step follows a server's death, because it belongs to the environment of the next one.
+    """
+    for index in range(kill_count):
+        life_s = rng.uniform(0.05, LONGEST_LIFE_S)
+        kind = index % 3
+        if kind == 0:
+            yield Kill(name="server", failpoint="", strike=_after(life_s))
+        elif kind == 1:
+            step = FAILPOINTS[index // 3 % len(FAILPOINTS)]
+            condition = f"{step}:exit@{0.1 if step in STEPS_OF_STARTS else 1.0}"
+            yield Kill(name=step, failpoint=condition, strike=_at_step)
+        else:
+            yield Kill(name="child", failpoint="", strike=_child_after(life_s))
+
+
+def crash(folder: Path, kill_count: int, seed: int, log: IO[bytes]) -> Outcome:
+    """Kill a server so many times; what it did not keep.
+
+    Args:
+        folder: of its data; new.
+        log: what the servers write to stderr.
+    """
+    began_s = time.monotonic()
+    outcome, ledger, rng = Outcome(seed=seed), Ledger(), random.Random(seed)
+    victim = Victim(folder, 0, log)
+    port = victim.port
+    checkers = [Checker(f"127.0.0.1:{port}", ledger, seed + k) for k in range(CHECKER_COUNT)]
+    for checker in checkers:
+        checker.start()
+    kills = list(plan(kill_count, rng))
+    for kill, following in zip(kills, [*kills[1:], None], strict=True):
+        outcome.kills[kill.name if kill.strike(victim) else f"{kill.name} (not met)"] += 1
+        if victim.is_dead_within(0):
+            outcome.broken += check_folder(folder).problems
+            victim = _restarted(
+                folder, port, log, outcome, following.failpoint if following else ""
+            )
+        if following is None or not following.failpoint:
+            with Client(f"127.0.0.1:{port}", retry=PATIENT, timeout_s=60.0) as client:
+                ledger.check(client)
+    for checker in checkers:
+        checker.end()
+    if victim.stop() != 0:
+        outcome.broken.append("the last server did not drain")
+    outcome.broken += ledger.broken + check_folder(folder).problems + _unended(folder, ledger)
+    outcome.ends.update(ledger.ends.values())
+    outcome.event_count = sum(ledger.events.values())
+    outcome.recording_count, outcome.map_count = len(ledger.digests), len(ledger.maps)
+    outcome.seconds = time.monotonic() - began_s
+    return outcome
+
+
+def _unended(folder: Path, ledger: Ledger) -> list[str]:
+    """Operations whose row says something else than their watcher was told."""
+    with Store(folder) as store:
+        rows = store.operations.page("", 1_000_000)
+    states = {f"operations/{row.id}": row.state for row in rows}
+    told = {
+        name: OperationState.SUCCEEDED if end == "SUCCEEDED" else OperationState.FAILED
+        for name, end in ledger.ends.items()
+    }
+    return [
+        f"{name}: told {told[name]}, is {states.get(name)}"
+        for name in told
+        if states.get(name) is not told[name]
+    ]
+
+
+def _restarted(folder: Path, port: int, log: IO[bytes], outcome: Outcome, failpoint: str) -> Victim:
+    began_s = time.monotonic()
+    started = Victim(folder, port, log, failpoint)
+    outcome.longest_restart_s = max(outcome.longest_restart_s, time.monotonic() - began_s)
+    return started
+
+
+def _after(life_s: float) -> Callable[[Victim], bool]:
+    def strike(victim: Victim) -> bool:
+        time.sleep(life_s)
+        victim.kill()
+        return victim.is_dead_within(60)
+
+    return strike
+
+
+def _at_step(victim: Victim) -> bool:
+    if victim.is_dead_within(STEP_TIMEOUT_S):
+        return True
+    victim.kill()
+    victim.is_dead_within(60)
+    return False
+
+
+def _child_after(life_s: float) -> Callable[[Victim], bool]:
+    def strike(victim: Victim) -> bool:
+        time.sleep(life_s)
+        deadline_s = time.monotonic() + STEP_TIMEOUT_S
+        while not victim.kill_a_child():
+            if time.monotonic() > deadline_s:
+                return False
+            time.sleep(0.01)
+        return True
+
+    return strike

@@ -1,0 +1,32 @@
+"""`python -m roel_crash.serve FOLDER PORT`: a server whose builds are those of `work`."""
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+
+
+def main() -> None:
+    """Serve until killed; the port goes to stdout."""
+    # Children import this module again; they have no use for the server.
+    from roel_service.service.server import serve
+    from roel_service.service.settings import Settings
+
+    folder, port = Path(sys.argv[1]), int(sys.argv[2])
+    logging.basicConfig(level=logging.INFO)
+    settings = Settings(
+        build_entrypoint="roel_crash.work:build",
+        retry_delay_s=0.05,
+        # Between a file and the row that names it lie milliseconds here: sweeps have work to do.
+        sweep_interval_s=0.5,
+        longest_upload_s=10.0,
+    )
+    asyncio.run(serve(folder, "127.0.0.1", port, on_ready=_announce, settings=settings))
+
+
+def _announce(address: str) -> None:
+    print(address.rpartition(":")[2], flush=True)
+
+
+if __name__ == "__main__":
+    main()
