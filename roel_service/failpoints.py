@@ -28,6 +28,7 @@ FAILPOINTS = (
     "task.leased",
     "task.previewed",
     "task.ended",
+    "stage.cached",
     "sweep.deleted",
 )
 

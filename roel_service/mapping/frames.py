@@ -82,16 +82,38 @@ def frame_times(
         range_us: first and last event; None where unknown: the poses' range, at `rate_hz`.
         config: rate, least number and longest window.
     """
-    reach_us = config.max_half_window_us
     limits_us = range_us or (int(trajectory.t_us[0]), int(trajectory.t_us[-1]))
-    inside = np.clip(trajectory.covered_us(), *limits_us) + np.array([reach_us, -reach_us])
-    inside = inside[inside[:, 0] <= inside[:, 1]]
+    inside = _inside_us(trajectory, limits_us, config)
     interval_us = 1e6 / config.rate_hz
     if range_us is not None:
         duration_us = float(np.diff(inside).sum())
         interval_us = min(interval_us, duration_us / config.min_frame_count)
+    return _times_us(inside, interval_us)
+
+
+def frame_times_so_far(
+    trajectory: Trajectory, range_us: tuple[int, int], config: FramesConfig
+) -> list[int]:
+    """Times of `frame_times` that are certain while a recording goes on.
+
+    They are the first ones of the whole recording, unless it ends so soon that they have to lie
+    closer together.
+    """
+    return _times_us(_inside_us(trajectory, range_us, config), 1e6 / config.rate_hz)
+
+
+def _inside_us(
+    trajectory: Trajectory, limits_us: tuple[int, int], config: FramesConfig
+) -> IntArray:
+    """(n, 2) spans of times around which the longest window lies within events and poses."""
+    reach_us = config.max_half_window_us
+    inside = np.clip(trajectory.covered_us(), *limits_us) + np.array([reach_us, -reach_us])
+    return np.asarray(inside[inside[:, 0] <= inside[:, 1]])
+
+
+def _times_us(spans_us: IntArray, interval_us: float) -> list[int]:
     step_us = max(1, round(interval_us))
-    return [t_us for first, last in inside.tolist() for t_us in range(first, last + 1, step_us)]
+    return [t_us for first, last in spans_us.tolist() for t_us in range(first, last + 1, step_us)]
 
 
 def frame_slices(
@@ -114,12 +136,13 @@ def frame_slices(
     for chunk in chunks:
         if len(chunk) == 0 or not waiting:
             continue
-        buffer = _extended(buffer, chunk, keep_from_us=waiting[0] - reach_us)
+        buffer = extended(buffer, chunk, keep_from_us=waiting[0] - reach_us)
         while waiting and waiting[0] + reach_us <= buffer.t_us[-1]:
             yield waiting.popleft(), buffer
 
 
-def _extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: int) -> EventStream:
+def extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: int) -> EventStream:
+    """The events of a buffer from a time on, and those of the next chunk."""
     if buffer is None:
         return chunk
     kept = buffer.between(keep_from_us, int(buffer.t_us[-1]) + 1)

@@ -5,9 +5,12 @@ What the events of a line say is summed up here, frame by frame, so that they ne
 
 from __future__ import annotations
 
+import copy
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -56,7 +59,9 @@ class Detected:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _FrameLines:
+class FrameLines:
+    """The lines of one frame; `detect_s` and `plane_fit_s` are what it took to find them."""
+
     t_us: int
     fitted: FittedLines
     event_forms: FloatArray
@@ -66,32 +71,51 @@ class _FrameLines:
     plane_fit_s: float
 
 
-def lines_of_all_frames(
-    events: CountedEvents,
-    trajectory: Trajectory,
-    camera: Camera,
-    config: Config,
-    detector: LineDetector,
-    run: MappingRun,
-) -> Detected:
-    """Detection and plane fit of every frame; frames are independent and run in threads.
+# Frames that were looked at before, by index and time.
+KnownFrames = Mapping[tuple[int, int], FrameLines]
+NO_KNOWN_FRAMES: KnownFrames = MappingProxyType({})
+
+# A frame's index and time, and a stream that holds the events around it.
+FrameSlice = tuple[int, tuple[int, EventStream]]
+
+
+class FrameReader:
+    """Finds the lines of single frames; they are independent of each other.
 
     Args:
-        events: read once, front to back.
-        trajectory, camera: poses and calibration.
-        config: every stage's table.
-        detector: finds lines in images.
-        run: is told how far the work is, and how long each stage took.
+        trajectory: covers the windows of the frames that are read.
     """
-    ideal_px = undistortion_table(camera)
 
-    def lines_of_frame(item: tuple[int, tuple[int, EventStream]]) -> _FrameLines:
+    def __init__(
+        self, trajectory: Trajectory, camera: Camera, config: Config, detector: LineDetector
+    ) -> None:
+        self._trajectory = trajectory
+        self._camera = camera
+        self._config = config
+        self._detector = detector
+        self._ideal_px = undistortion_table(camera)
+
+    def covering(self, trajectory: Trajectory) -> FrameReader:
+        """The same with more poses."""
+        reader = copy.copy(self)
+        reader._trajectory = trajectory
+        return reader
+
+    def read(self, item: FrameSlice) -> FrameLines:
+        """Detection and plane fit of one frame."""
         index, (t_us, stream) = item
+        config = self._config
         started = time.perf_counter()
         frame = event_frame(
-            stream, t_us, ideal_px, trajectory, camera, config.frames, config.detect
+            stream,
+            t_us,
+            self._ideal_px,
+            self._trajectory,
+            self._camera,
+            config.frames,
+            config.detect,
         )
-        seeds = detect_lines(event_images(frame, config.detect), detector, config.detect)
+        seeds = detect_lines(event_images(frame, config.detect), self._detector, config.detect)
         images = images_to_match(index, frame, config)
         detected = time.perf_counter()
         rng = np.random.default_rng(np.random.SeedSequence(config.runtime.seed, spawn_key=(index,)))
@@ -99,12 +123,12 @@ def lines_of_all_frames(
         # The events end here: memory grows with the lines, not with the recording.
         forms = supporting_forms(
             observations_of_frames([fitted]),
-            frames_at(np.array([t_us]), trajectory, camera),
-            trajectory,
+            frames_at(np.array([t_us]), self._trajectory, self._camera),
+            self._trajectory,
             config.frames,
             config.refine,
         )
-        return _FrameLines(
+        return FrameLines(
             t_us=t_us,
             fitted=fitted.without_events(),
             event_forms=forms,
@@ -114,15 +138,41 @@ def lines_of_all_frames(
             plane_fit_s=time.perf_counter() - detected,
         )
 
+
+def lines_of_all_frames(
+    events: CountedEvents,
+    trajectory: Trajectory,
+    camera: Camera,
+    config: Config,
+    detector: LineDetector,
+    run: MappingRun,
+    known: KnownFrames = NO_KNOWN_FRAMES,
+) -> Detected:
+    """Detection and plane fit of every frame; frames are independent and run in threads.
+
+    Args:
+        events: read once, front to back.
+        trajectory, camera: poses and calibration.
+        config: every stage's table.
+        detector: finds lines in images.
+        run: is told how far the work is, and how long each stage took.
+        known: frames that need not be read again.
+    """
+    reader = FrameReader(trajectory, camera, config, detector)
+
+    def lines_of_frame(item: FrameSlice) -> FrameLines:
+        index, (t_us, _) = item
+        return known.get((index, t_us)) or reader.read(item)
+
     times_us = frame_times(trajectory, events.time_range_us, config.frames)
     reach_us = config.frames.max_half_window_us
     slices = enumerate(frame_slices(events.chunks(), times_us, reach_us))
+    cached_count = sum((index, t_us) in known for index, t_us in enumerate(times_us))
     began = time.perf_counter()
-    worker_count = config.runtime.worker_count or os.cpu_count() or 1
-    done: list[_FrameLines] = []
-    for lines in in_order(lines_of_frame, slices, worker_count):
+    done: list[FrameLines] = []
+    for lines in in_order(lines_of_frame, slices, worker_count(config)):
         done.append(lines)
-        run.step(len(done), len(times_us))
+        run.step(len(done), len(times_us), cached_count)
     run.share_wall_clock(
         time.perf_counter() - began,
         {
@@ -143,3 +193,8 @@ def lines_of_all_frames(
         ),
         images={index: lines.images for index, lines in enumerate(done)},
     )
+
+
+def worker_count(config: Config) -> int:
+    """Threads of the front end."""
+    return config.runtime.worker_count or os.cpu_count() or 1

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 
 import numpy as np
 
-from roel_service.config.stages import Config, RefineConfig
+from roel_service.config.stages import Config
+from roel_service.mapping.cached_stages import CachedStages, triangulation_cost
 from roel_service.mapping.detect import LineDetector, line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import (
     Frames,
 )
-from roel_service.mapping.front_end import lines_of_all_frames
+from roel_service.mapping.front_end import (
+    NO_KNOWN_FRAMES,
+    Detected,
+    KnownFrames,
+    lines_of_all_frames,
+)
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
-from roel_service.mapping.match_points import PointLineMatcher, point_matcher
+from roel_service.mapping.match_points import PointLineMatcher, PointMatcher, point_matcher
 from roel_service.mapping.match_sampled import (
     GeometricMatcher,
     LineMatcher,
@@ -26,19 +32,20 @@ from roel_service.mapping.merge import merge_duplicates
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun
+from roel_service.mapping.stage_cache import NoCache, StageCache
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.trim import trim_to_segments
 from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
-from roel_service.scene.lines import LineTracks
+from roel_service.scene.lines import LineMap, LineTracks
 from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
 from roel_service.scene.trajectory import Trajectory
 
 # Share of the whole job that refining the poses takes.
 POSES_SHARE = 0.6
-# Below every length: with this cap all observations weigh the same.
-EQUAL_WEIGHTS_PX = 1.0
+
+NO_CACHE = NoCache()
 
 
 def build_line_map(
@@ -50,6 +57,9 @@ def build_line_map(
     detector: LineDetector | None = None,
     matcher: LineMatcher | None = None,
     progress: ProgressCallback = ignore,
+    cache: StageCache = NO_CACHE,
+    known: KnownFrames = NO_KNOWN_FRAMES,
+    on_preview: Callable[[LineMap], None] | None = None,
 ) -> MappingResult:
     """Reconstruct a 3D line map from events and poses.
 
@@ -64,6 +74,10 @@ def build_line_map(
         matcher: finds correspondences for `match_global.method = "sampled"`; takes the place of
             the configured one.
         progress: called often; may raise `Cancelled`.
+        cache: has what stages found in an earlier job on the same recording, and gets what they
+            find in this one; only for the configured detector and matcher.
+        known: frames that were looked at before, with the same configuration.
+        on_preview: gets the lines as they are before re-association and refinement.
 
     Raises:
         ConfigError: the configured matcher lacks its extra or its checkpoint.
@@ -77,6 +91,8 @@ def build_line_map(
         before = part_of(progress, 0.0, POSES_SHARE)
         poses = refine_poses(events, trajectory, camera, config, progress=before)
         trajectory = poses.trajectory
+        # What was found before, was found from other poses.
+        cache, known = NO_CACHE, NO_KNOWN_FRAMES
         run = MappingRun(part_of(progress, POSES_SHARE, 1.0), seconds=poses.report.seconds)
     rng = np.random.default_rng(config.runtime.seed)
     counted = CountedEvents(events, trajectory)
@@ -84,31 +100,29 @@ def build_line_map(
     needs_points = matcher is None and config.match_global.matches_points
     points = point_matcher(config.match_global) if needs_points else None
 
-    detected = lines_of_all_frames(counted, trajectory, camera, config, detector, run)
-    frames, observations, evidence = detected.frames, detected.observations, detected.evidence
-    counted.check_coverage()
-    with run.stage("match_local"):
-        tracks = match_adjacent_frames(
-            observations,
-            frames,
-            config.match_local,
-            rotation_is_undone=config.frames.compensate_rotation,
-        )
-    if config.match_global.method == "sampled":
+    def detect() -> Detected:
+        return lines_of_all_frames(counted, trajectory, camera, config, detector, run, known)
+
+    def triangulate() -> Refined:
+        tracks = _tracks(detected, config, matcher, points, run)
+        with run.stage("triangulate"):
+            return _triangulate(tracks, evidence, frames, config, rng, run)
+
+    def associate_again() -> Refined:
         with run.stage("match_global"):
-            matcher = matcher or (
-                PointLineMatcher(points, detected.images, evidence.views, config.match_global)
-                if points
-                else GeometricMatcher(tracks, evidence.views, frames, config)
-            )
-            tracks = match_sampled_frames(tracks, evidence.views, frames, config, matcher, run.step)
-    with run.stage("triangulate"):
-        refined = _triangulate(tracks, evidence, frames, config, rng, run)
-    if config.match_global.method == "reassociate":
-        with run.stage("match_global"):
-            refined = reassociate(
+            return reassociate(
                 refined, evidence, observations, frames, trajectory, config, run.step
             )
+
+    stages = CachedStages(run, cache, config)
+    detected = stages.detected(detect, counted, trajectory, camera)
+    frames, observations, evidence = detected.frames, detected.observations, detected.evidence
+    counted.check_coverage()
+    refined = stages.triangulated(triangulate)
+    if on_preview is not None:
+        on_preview(trim_to_segments(refined, evidence.views, frames, config.trim)[0])
+    if config.match_global.method == "reassociate":
+        refined = stages.associated(associate_again)
     with run.stage("refine"):
         prior = direction_prior(refined, config.refine)
         refined = run.without_diverged(
@@ -132,6 +146,33 @@ def build_line_map(
     )
 
 
+def _tracks(
+    detected: Detected,
+    config: Config,
+    matcher: LineMatcher | None,
+    points: PointMatcher | None,
+    run: MappingRun,
+) -> LineTracks:
+    """Observations of adjacent frames and, if configured, of distant ones that show one line."""
+    frames, views = detected.frames, detected.evidence.views
+    with run.stage("match_local"):
+        tracks = match_adjacent_frames(
+            detected.observations,
+            frames,
+            config.match_local,
+            rotation_is_undone=config.frames.compensate_rotation,
+        )
+    if config.match_global.method != "sampled":
+        return tracks
+    with run.stage("match_global"):
+        matcher = matcher or (
+            PointLineMatcher(points, detected.images, views, config.match_global)
+            if points
+            else GeometricMatcher(tracks, views, frames, config)
+        )
+        return match_sampled_frames(tracks, views, frames, config, matcher, run.step)
+
+
 def _triangulate(
     tracks: LineTracks,
     evidence: Evidence,
@@ -144,28 +185,10 @@ def _triangulate(
     found = triangulate_tracks(tracks, evidence.views, frames, config.triangulate, rng)
     run.count([status for status in found.statuses if status is not TrackStatus.TRIANGULATED])
     refined = run.without_diverged(
-        refine_lines(found.lines, found.tracks, evidence, frames, _triangulation_cost(config))
+        refine_lines(found.lines, found.tracks, evidence, frames, triangulation_cost(config))
     )
     if not config.triangulate.merge:
         return refined
     refined, merged = merge_duplicates(refined, evidence.views, frames, config.triangulate)
     run.count(merged)
     return refined
-
-
-def _triangulation_cost(config: Config) -> RefineConfig:
-    """What refines a hypothesis over its inliers.
-
-    With the paper's gate it is the paper's cost: the sum of the line term alone, unweighted.
-    """
-    steps = config.triangulate.iteration_count
-    if config.triangulate.gate == "pixel":
-        return replace(config.refine, iteration_count=steps)
-    return replace(
-        config.refine,
-        residual="grassmann",
-        loss="squared",
-        event_weight=0.0,
-        max_length_weight_px=EQUAL_WEIGHTS_PX,
-        iteration_count=steps,
-    )

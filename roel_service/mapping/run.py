@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from roel_service.arrays import Array
+from roel_service.arrays import Array, IntArray
 from roel_service.errors import EventsError, TrajectoryError
 from roel_service.mapping.refine import Refined
 from roel_service.progress import Progress, ProgressCallback
@@ -63,6 +63,15 @@ class CountedEvents:
         stop = np.searchsorted(t_us, self._covered_us[:, 1], side="right")
         self.covered_count += int((stop - start).sum())
 
+    def counts(self) -> IntArray:
+        """(4,) what was counted, and the first and last event; for `restore`."""
+        return np.array([self.total_count, self.covered_count, *(self._range_us or (1, 0))])
+
+    def restore(self, counts: IntArray) -> None:
+        """Stand as if the events had been read."""
+        self.total_count, self.covered_count, first_us, last_us = counts.tolist()
+        self._range_us = (first_us, last_us) if first_us <= last_us else None
+
     def check_coverage(self) -> None:
         """Raise if there were no events, or if the poses belong to another time."""
         if self._range_us is None:
@@ -99,6 +108,11 @@ class MappingRun:
     _stage: str = "detect"
     _fraction: float = 0.0
 
+    def skip(self, name: str, count: int) -> None:
+        """Tell the caller that a stage's results are known already: so many units of work."""
+        self._stage = name
+        self.step(count, count, cached_count=count)
+
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
         """Time a stage and tell the caller that it begins."""
@@ -125,7 +139,7 @@ class MappingRun:
         self.count([TrackStatus.DIVERGED] * int(refined.diverged.sum()))
         return refined.take(~refined.diverged)
 
-    def step(self, done_count: int, total_count: int) -> None:
+    def step(self, done_count: int, total_count: int, cached_count: int = 0) -> None:
         """Tell the caller how far the current stage is."""
         begin = STAGE_BEGINS[self._stage]
         end = min((b for b in STAGE_BEGINS.values() if b > begin), default=1.0)
@@ -138,5 +152,6 @@ class MappingRun:
                 done_count=done_count,
                 total_count=total_count,
                 fraction=self._fraction,
+                cached_count=cached_count,
             )
         )

@@ -34,8 +34,10 @@ class BlobStore:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         make_folder(folder)
-        for aside in folder.glob("[0-9a-f]" * 64 + ".part"):
-            # A crash came between the two looks of `discard`.
+
+    def recover(self) -> None:
+        """Put back what a crash left between the two looks of `discard`; nobody else is at work."""
+        for aside in self._folder.glob("[0-9a-f]" * 64 + ".part"):
             _put_back(aside, self.path(aside.stem))
             aside.unlink()
 

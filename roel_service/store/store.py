@@ -71,6 +71,7 @@ class Store:
             self.event_streams.recover()
             self.uploads.recover()
             self._scratch = _emptied(folder / "scratch")
+            self._blobs.recover()
             self._resources = resources.pop_all()
 
     def __enter__(self) -> Store:

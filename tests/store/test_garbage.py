@@ -67,7 +67,7 @@ def test_what_a_crash_left_between_the_two_looks_comes_back(full, folder):
     named = full.maps.version("house", 1).sha256
     path = full._blobs.path(named)
     path.rename(folder / "blobs" / "sha256" / f"{named}.part")
-    type(full._blobs)(folder / "blobs" / "sha256")
+    full._blobs.recover()
     assert full._blobs.read(named) == b"map"
 
 
