@@ -9,7 +9,8 @@ from pathlib import Path
 def main() -> None:
     """Serve until killed; the port goes to stdout."""
     # Children import this module again; they have no use for the server.
-    from roel_service.service.server import serve
+    from roel_service.service.listen import Listen
+    from roel_service.service.server import Addresses, serve
     from roel_service.service.settings import Settings
 
     folder, port = Path(sys.argv[1]), int(sys.argv[2])
@@ -21,11 +22,11 @@ def main() -> None:
         sweep_interval_s=0.5,
         longest_upload_s=10.0,
     )
-    asyncio.run(serve(folder, "127.0.0.1", port, on_ready=_announce, settings=settings))
 
+    def announce(addresses: Addresses) -> None:
+        print(addresses.calls.rpartition(":")[2], flush=True)
 
-def _announce(address: str) -> None:
-    print(address.rpartition(":")[2], flush=True)
+    asyncio.run(serve(folder, Listen(port=port), on_ready=announce, settings=settings))
 
 
 if __name__ == "__main__":

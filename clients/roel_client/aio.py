@@ -206,10 +206,16 @@ class AsyncClient:
         created = await self._connection.call(self._maps.CreateMap, request)
         return str(created.name)
 
-    async def build_map(self, map_name: str, stream: str, config: Config) -> AsyncOperation:
-        """Begin to build a new version of a map from a frozen recording."""
+    async def build_map(
+        self, map_name: str, stream: str, config: Config, *, follow: bool = False
+    ) -> AsyncOperation:
+        """Begin to build a new version of a map from a recording.
+
+        Args:
+            follow: the recording may still be open; lines are looked for while it arrives.
+        """
         request = maps_pb2.BuildMapRequest(
-            parent=map_name, event_stream=stream, config=config_to_proto(config)
+            parent=map_name, event_stream=stream, config=config_to_proto(config), follow=follow
         )
         begun = await self._connection.call(self._maps.BuildMap, request)
         return self.operation(begun.name)

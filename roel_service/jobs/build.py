@@ -8,16 +8,23 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
+
+import numpy as np
 
 from roel_service import __version__
 from roel_service.config.load import to_tables, to_toml
 from roel_service.config.stages import Config, RegisterConfig, RuntimeConfig
 from roel_service.errors import NoAnswerError
-from roel_service.jobs.inputs import BuildParameters
-from roel_service.mapping.pipeline import build_line_map
+from roel_service.jobs.following import follow
+from roel_service.jobs.inputs import BuildParameters, FollowParameters
+from roel_service.jobs.stage_files import StageFiles
+from roel_service.jobs.task import Partial, Tell
+from roel_service.mapping.front_end import NO_KNOWN_FRAMES, KnownFrames
+from roel_service.mapping.pipeline import NO_CACHE, build_line_map
+from roel_service.mapping.stage_cache import StageCache
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource, EventStream
@@ -56,18 +63,23 @@ class BuiltMap:
     report: Report
 
 
-def run_build(parameters: BuildParameters, progress: ProgressCallback) -> BuiltVersion:
-    """Entry point of a build in a child; errors as of `build_map`."""
+def run_build(parameters: BuildParameters | FollowParameters, tell: Tell) -> BuiltVersion:
+    """Entry point of a build in a child; errors as of `build_map` and `follow`."""
+    known = NO_KNOWN_FRAMES
+    if isinstance(parameters, FollowParameters):
+        known, parameters = follow(parameters, tell)
     events, trajectory, camera = parameters.open()
-    built = build_map(events, trajectory, camera, parameters.config, progress)
-    ends = built.line_map.segments.reshape(-1, 3)
-    return BuiltVersion(
-        rlm_bytes=built.rlm_bytes,
-        line_count=len(built.line_map),
-        bounds_m=[*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()],
-        report=built.report,
-        provenance=asdict(decode_map(built.rlm_bytes).provenance),
+    built = build_map(
+        events,
+        trajectory,
+        camera,
+        parameters.config,
+        tell,
+        cache=_cache(parameters),
+        known=known,
+        on_preview=lambda preview: tell(Partial(result=_version(preview))),
     )
+    return _version(built)
 
 
 def build_map(
@@ -76,8 +88,16 @@ def build_map(
     camera: Camera,
     config: Config,
     progress: ProgressCallback = ignore,
+    *,
+    cache: StageCache = NO_CACHE,
+    known: KnownFrames = NO_KNOWN_FRAMES,
+    on_preview: Callable[[BuiltMap], None] | None = None,
 ) -> BuiltMap:
     """Build a map and pack it; equal inputs give equal bytes, here and on a server.
+
+    Args:
+        cache, known: as of `build_line_map`.
+        on_preview: gets a first map before its refinement, if that is one; without a report.
 
     Raises:
         NoAnswerError: TOO_FEW_LINES, with the report as its result.
@@ -85,32 +105,52 @@ def build_map(
     """
     start_s = time.perf_counter()
     source = _DigestedSource(events)
-    result = build_line_map(source, trajectory, camera, config, progress=progress)
-    provenance = Provenance(
-        config_digest=config_digest(config),
-        events_sha256=source.digest.hexdigest(),
-        poses_sha256=poses_digest(trajectory),
-        camera_sha256=camera_digest(camera),
+
+    def pack(line_map: LineMap, report: Report) -> BuiltMap:
+        provenance = Provenance(
+            config_digest=config_digest(config),
+            events_sha256=_events_sha256(source, cache),
+            poses_sha256=poses_digest(trajectory),
+            camera_sha256=camera_digest(camera),
+        )
+        rlm_bytes = encode_map(line_map, provenance)
+        packed = decode_map(rlm_bytes).line_map
+        return BuiltMap(rlm_bytes=rlm_bytes, line_map=packed, trajectory=trajectory, report=report)
+
+    def tell_preview(line_map: LineMap) -> None:
+        if on_preview is None or len(line_map) < MIN_LINE_COUNT:
+            return
+        preview = pack(line_map, {})
+        if len(preview.line_map) >= MIN_LINE_COUNT:
+            on_preview(preview)
+
+    result = build_line_map(
+        source,
+        trajectory,
+        camera,
+        config,
+        progress=progress,
+        cache=cache,
+        known=known,
+        on_preview=tell_preview if on_preview is not None else None,
     )
-    rlm_bytes = encode_map(result.line_map, provenance)
-    line_map = decode_map(rlm_bytes).line_map
+    built = pack(result.line_map, {})
+    line_count = len(built.line_map)
     report = {
         "frame_count": result.report.frame_count,
         "event_count": result.report.event_count,
-        "line_count": len(line_map),
+        "line_count": line_count,
         "seconds": {stage: result.report.seconds.get(stage, 0.0) for stage in MAPPING_STAGES},
         "seconds_total": time.perf_counter() - start_s,
         "peak_rss_mib": peak_rss_mib(),
         "config": to_tables(config),
         "versions": versions(),
     }
-    if len(line_map) < MIN_LINE_COUNT:
+    if line_count < MIN_LINE_COUNT:
         expected = f"at least {MIN_LINE_COUNT} lines"
-        found = f"{len(line_map)}"
-        raise NoAnswerError("map", expected, found, reason="TOO_FEW_LINES", result=report)
-    return BuiltMap(
-        rlm_bytes=rlm_bytes, line_map=line_map, trajectory=result.trajectory, report=report
-    )
+        reason = "TOO_FEW_LINES"
+        raise NoAnswerError("map", expected, f"{line_count}", reason=reason, result=report)
+    return dataclasses.replace(built, trajectory=result.trajectory, report=report)
 
 
 def config_digest(config: Config) -> str:
@@ -133,12 +173,44 @@ def versions() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
+def _version(built: BuiltMap) -> BuiltVersion:
+    ends = built.line_map.segments.reshape(-1, 3)
+    return BuiltVersion(
+        rlm_bytes=built.rlm_bytes,
+        line_count=len(built.line_map),
+        bounds_m=[*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()],
+        report=built.report,
+        provenance=asdict(decode_map(built.rlm_bytes).provenance),
+    )
+
+
+def _cache(parameters: BuildParameters) -> StageCache:
+    if parameters.cache is None:
+        return NO_CACHE
+    place = parameters.cache
+    return StageFiles(place.folder, parameters.recording_digest, place.max_bytes)
+
+
+def _events_sha256(source: _DigestedSource, cache: StageCache) -> str:
+    """Digest of all events; they are read for it alone where nothing else needed them."""
+    if not source.was_read:
+        kept = cache.get("events", None)
+        if kept is not None:
+            return bytes(kept["sha256"]).hex()
+        for _ in source.chunks():
+            pass
+    sha256 = source.digest.hexdigest()
+    cache.keep("events", None, {"sha256": np.frombuffer(bytes.fromhex(sha256), np.uint8)})
+    return sha256
+
+
 class _DigestedSource:
     """A source that takes the digest of the events while they pass by, each time anew."""
 
     def __init__(self, source: EventSource) -> None:
         self._source = source
         self.digest = EventDigest()
+        self.was_read = False
 
     @property
     def width(self) -> int:
@@ -154,7 +226,8 @@ class _DigestedSource:
 
     def chunks(self) -> Iterator[EventStream]:
         """The chunks of the source."""
-        self.digest = EventDigest()
+        self.digest, self.was_read = EventDigest(), False
         for chunk in self._source.chunks():
             self.digest.update(chunk)
             yield chunk
+        self.was_read = True

@@ -7,9 +7,14 @@ from typing import Any
 
 from roel_service.config.stages import Config
 from roel_service.jobs.imports import ImportParameters
-from roel_service.jobs.inputs import BuildParameters
-from roel_service.store.records import OperationRecord, TaskRecord
-from roel_service.store.store import Store
+from roel_service.jobs.inputs import (
+    BuildParameters,
+    CachePlace,
+    FollowParameters,
+    sealed_parameters,
+)
+from roel_service.store.records import OperationRecord, StreamState, TaskRecord
+from roel_service.store.store import CACHE, Store
 from roel_service.v1 import config_pb2
 from roel_service.wire.configs import config_from_proto, config_to_proto
 
@@ -34,20 +39,31 @@ def import_preparation(store: Store) -> Prepare:
     return prepare
 
 
-def build_preparation(store: Store, entrypoint: str) -> Prepare:
-    """How a build is prepared: its recording is frozen and cannot be deleted meanwhile."""
+def build_preparation(
+    store: Store, entrypoint: str, *, cache_bytes: int, patience_s: float
+) -> Prepare:
+    """How a build is prepared: its recording cannot be deleted meanwhile.
 
-    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, BuildParameters]:
-        streams = store.event_streams
-        stream = streams.get(operation.event_stream_id)
+    Args:
+        cache_bytes: kept of the results of stages; 0 keeps nothing.
+        patience_s: an upload that is followed may stand still for so long.
+    """
+    cache = CachePlace(folder=store.folder / CACHE, max_bytes=cache_bytes) if cache_bytes else None
+
+    def prepare(
+        operation: OperationRecord, task: TaskRecord
+    ) -> tuple[str, BuildParameters | FollowParameters]:
+        stream = store.event_streams.get(operation.event_stream_id)
         message = config_pb2.MappingConfig.FromString(task.parameters)
-        return entrypoint, BuildParameters(
-            event_file=streams.event_file(stream),
-            time_range_us=(stream.start_us, stream.end_us),
-            chunk_lengths=streams.chunk_lengths(stream),
-            pose_files=streams.pose_files(stream),
-            camera=stream.camera,
-            config=config_from_proto(message, "default"),
+        config = config_from_proto(message, "default")
+        if stream.state is StreamState.FINALIZED:
+            return entrypoint, sealed_parameters(store.event_streams, stream, config, cache)
+        return entrypoint, FollowParameters(
+            folder=store.folder,
+            stream_id=stream.id,
+            config=config,
+            patience_s=patience_s,
+            cache=cache,
         )
 
     return prepare

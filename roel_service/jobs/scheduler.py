@@ -26,6 +26,7 @@ from roel_service.store.records import (
     now_us,
 )
 from roel_service.store.tasks import Tasks
+from roel_service.wire import names
 from roel_service.wire.errors import status_from_error
 
 logger = logging.getLogger(__name__)
@@ -228,7 +229,8 @@ class Scheduler:
             # Told with the next progress: on its own it is not worth a write.
             metadata.note_usage(news)
         elif isinstance(news, Partial):
-            await self._record(self._operations.preview, task.lease, news.result)
+            record = await self._record(self._operations.preview, task.lease, news.result)
+            metadata.note_preview(names.map_version_name(record.map_id, record.version))
         else:
             metadata.note_progress(news)
             await self._advance(task, news, metadata)
@@ -275,19 +277,22 @@ class Scheduler:
         )
         logger.info("%s %s: to be tried again", record.method.value, record.id)
 
-    async def _end_attempt(self, ending: Coroutine[Any, Any, None]) -> None:
+    async def _end_attempt(self, ending: Coroutine[Any, Any, object]) -> None:
         """An attempt that was cancelled or replaced has no say any more."""
         try:
             await ending
         except ConflictError as error:
             logger.info("an attempt does not count: %s", error)
 
-    async def _record(self, change: Callable[..., OperationRecord], *arguments: object) -> None:
+    async def _record(
+        self, change: Callable[..., OperationRecord], *arguments: object
+    ) -> OperationRecord:
         """Make a change durable, then tell whoever waits for it."""
         record = await asyncio.to_thread(change, *arguments)
         if record.state.is_final:
             logger.info("%s %s: %s", record.method.value, record.id, record.state.value)
         self.changes.announce()
+        return record
 
 
 def _encoded(error: RoelError) -> bytes:

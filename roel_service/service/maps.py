@@ -100,7 +100,9 @@ class MapServicer:
         stream_id = names.event_stream_id(request.event_stream)
         config = _requested_config(request)
         if request.validate_only:
-            version = await asyncio.to_thread(self._store.builds.check, map_id, stream_id)
+            version = await asyncio.to_thread(
+                self._store.builds.check, map_id, stream_id, follow=request.follow
+            )
             return _validated(map_id, version, request.event_stream)
         identity = request_id(request)
         begin = partial(
@@ -110,6 +112,7 @@ class MapServicer:
             content_sha256(request),
             parameters=build_parameters_to_bytes(config),
             request=identity,
+            follow=request.follow,
         )
         return await self._submitted(begin, identity)
 

@@ -131,7 +131,12 @@ async def running(
 
 
 def _scheduler(store: Store, settings: Settings) -> Scheduler:
-    build = build_preparation(store, settings.build_entrypoint)
+    build = build_preparation(
+        store,
+        settings.build_entrypoint,
+        cache_bytes=settings.stage_cache_bytes,
+        patience_s=settings.follow_patience_s,
+    )
     return Scheduler(
         store.operations,
         store.tasks,

@@ -35,6 +35,8 @@ class Settings:
         upload_silence_s: an upload that sends nothing for this long is ended.
         commit_interval_s, commit_bytes: what an upload sent is made durable when its first part is
             this old, or when it is this much.
+        stage_cache_bytes: kept of the results of stages, for builds that differ only in later ones.
+        follow_patience_s: an upload that a build follows may stand still for so long.
         sweep_interval_s: time between two collections of garbage.
         longest_upload_s: files that nobody names are no garbage before.
         download_part_bytes: size of the messages of a download.
@@ -67,6 +69,8 @@ class Settings:
     open_uploads: int = 64
     upload_silence_s: float = 60.0
     commit_interval_s: float = 0.02
+    stage_cache_bytes: int = 2 * GIB
+    follow_patience_s: float = 600.0
     sweep_interval_s: float = 3600.0
     longest_upload_s: float = LONGEST_UPLOAD_S
     commit_bytes: int = 8 * MIB

@@ -8,10 +8,10 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, update
 
-from roel_service.errors import NotFoundError, StateError
+from roel_service.errors import NotFoundError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
-from roel_service.store.event_streams import get_finalized
+from roel_service.store.event_streams import get_mappable
 from roel_service.store.map_rows import get_map
 from roel_service.store.operations import operation_memory, queued_operation
 from roel_service.store.records import (
@@ -70,12 +70,14 @@ class Builds:
         *,
         parameters: bytes = b"",
         request: RequestId | None = None,
+        follow: bool = False,
     ) -> OperationRecord:
         """A new version, the operation that builds it, and its task with these parameters.
 
         Args:
             request_sha256: digest of what was asked for.
             request: what the caller named the request; the same one has the same operation.
+            follow: the recording may be open; the build follows its upload.
 
         Raises:
             NotFoundError: no such map or recording.
@@ -83,7 +85,7 @@ class Builds:
         """
 
         def act(connection: Connection) -> OperationRecord:
-            version = _next_version(connection, map_id, stream_id)
+            version = _next_version(connection, map_id, stream_id, follow=follow)
             operation = queued_operation(
                 OperationMethod.BUILD_MAP,
                 request_sha256=request_sha256,
@@ -99,10 +101,10 @@ class Builds:
             memory = operation_memory(connection)
             return once(connection, request, memory, lambda: act(connection))
 
-    def check(self, map_id: str, stream_id: str) -> int:
+    def check(self, map_id: str, stream_id: str, *, follow: bool = False) -> int:
         """Number of the version that a build would begin now; raises as `begin`."""
         with self._database.read() as connection:
-            return _next_version(connection, map_id, stream_id)
+            return _next_version(connection, map_id, stream_id, follow=follow)
 
     def begin_import(
         self,
@@ -196,10 +198,10 @@ def insert_version(
     connection.execute(insert(OPERATION), row_from_record(operation))
 
 
-def _next_version(connection: Connection, map_id: str, stream_id: str) -> int:
+def _next_version(connection: Connection, map_id: str, stream_id: str, *, follow: bool) -> int:
+    """Number of the version that a build begins; raises as `Builds.begin`."""
     version = get_map(connection, map_id).version_count + 1
-    if get_finalized(connection, stream_id).pose_count == 0:
-        raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
+    get_mappable(connection, stream_id, may_be_open=follow)
     return version
 
 

@@ -230,6 +230,10 @@ class EventStreams:
         """The sealed chunks of a finalized recording."""
         return self._blobs.path(record.digest)
 
+    def append_file(self, record: EventStreamRecord) -> Path:
+        """The chunks of an open recording; what lies behind its `size_bytes` is not committed."""
+        return self._recordings.path(record.uid)
+
     def chunk_lengths(self, record: EventStreamRecord) -> list[int]:
         """Bytes of every chunk, in order."""
         of_stream = EVENT_CHUNK.c.stream_uid == record.uid
@@ -263,6 +267,16 @@ def get_finalized(connection: Connection, stream_id: str) -> EventStreamRecord:
     if record.state is not StreamState.FINALIZED:
         reason = "STREAM_NOT_FINALIZED"
         raise StateError(stream_id, "a finalized recording", record.state.value, reason=reason)
+    return record
+
+
+def get_mappable(connection: Connection, stream_id: str, *, may_be_open: bool) -> EventStreamRecord:
+    """A recording for a build; raises `StateError` STREAM_NOT_FINALIZED, or NO_POSES."""
+    record = _get(connection, stream_id)
+    if record.state is StreamState.OPEN and may_be_open:
+        return record
+    if get_finalized(connection, stream_id).pose_count == 0:
+        raise StateError(stream_id, "a recording with poses", "none", reason="NO_POSES")
     return record
 
 

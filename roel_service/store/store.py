@@ -33,10 +33,17 @@ from roel_service.store.uploads import Uploads
 AUDIT_ROW_COUNT = 1_000_000
 
 
+ROWS = "rows.sqlite"
+BLOBS = "blobs/sha256"
+RECORDINGS = "recordings"
+CACHE = "cache"
+
+
 class Store:
     """What a server remembers; a context manager that holds the folder's lock.
 
     Attributes:
+        folder: where it is.
         event_streams, uploads, maps, builds, operations, tasks: the repositories.
         principals, audit: who may call, and who changed what.
 
@@ -47,14 +54,14 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         _check_folder(folder)
-        self._folder = folder
+        self.folder = folder
         with ExitStack() as resources:
             resources.enter_context(_locked(folder))
-            self._database = Database(folder / "rows.sqlite")
+            self._database = Database(folder / ROWS)
             resources.callback(self._database.close)
             self._database.migrate()
-            self._blobs = BlobStore(folder / "blobs" / "sha256")
-            self._recordings = Recordings(folder / "recordings")
+            self._blobs = BlobStore(folder / BLOBS)
+            self._recordings = Recordings(folder / RECORDINGS)
             self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
             self.maps = Maps(self._database, self._blobs)
             self.builds = Builds(self._database, self._blobs)
@@ -96,7 +103,7 @@ class Store:
             self.principals.is_empty()
         except SQLAlchemyError as error:
             problems.append(f"the database cannot be read: {type(error).__name__}")
-        if not os.access(self._folder, os.W_OK | os.X_OK):
+        if not os.access(self.folder, os.W_OK | os.X_OK):
             problems.append("the data folder cannot be written")
         return problems
 
@@ -116,12 +123,23 @@ def opened_principals(folder: Path) -> Iterator[Principals]:
         StateError: DATA_IN_USE, a server of an older release has the folder; DATA_TOO_NEW.
     """
     _check_folder(folder)
-    database = Database(folder / "rows.sqlite")
+    database = Database(folder / ROWS)
     try:
         if not database.is_current():
             with _locked(folder):
                 database.migrate()
         yield Principals(database)
+    finally:
+        database.close()
+
+
+@contextmanager
+def recordings_of(folder: Path) -> Iterator[EventStreams]:
+    """The recordings of a folder that a server has open; to be read, not to be changed."""
+    database = Database(folder / ROWS)
+    try:
+        blobs = BlobStore(folder / BLOBS)
+        yield EventStreams(database, blobs, Recordings(folder / RECORDINGS))
     finally:
         database.close()
 

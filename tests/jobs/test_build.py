@@ -104,6 +104,121 @@ def test_neither_chunks_nor_workers_change_a_byte(events, built, worker_count):
     assert again.rlm_bytes == built.rlm_bytes
 
 
+class Memory:
+    """A cache that also says what was asked for."""
+
+    def __init__(self):
+        self.entries, self.missed = {}, []
+
+    def get(self, stage, parameters):
+        found = self.entries.get((stage, repr(parameters)))
+        if found is None:
+            self.missed.append(stage)
+        return found
+
+    def keep(self, stage, parameters, found):
+        self.entries[stage, repr(parameters)] = found
+
+
+class Unread(Pieces):
+    """The recording, which nobody may read."""
+
+    def chunks(self):
+        raise AssertionError("the events are read")
+
+
+def rebuilt(events, config, memory):
+    """A build with a cache, the stages that it missed there, and the units of work it found."""
+    memory.missed = []
+    cached = {}
+
+    def note(progress):
+        cached[progress.stage] = max(progress.cached_count, cached.get(progress.stage, 0))
+
+    source = Pieces(events, 5000) if not memory.entries else Unread(events, 5000)
+    again = build_map(source, wireframe.trajectory(), wireframe.CAMERA, config, note, cache=memory)
+    return again, memory.missed, {stage for stage, count in cached.items() if count}
+
+
+@pytest.fixture(scope="module")
+def first_build(events):
+    """A build that has filled a cache."""
+    memory = Memory()
+    return rebuilt(events, CONFIG, memory)[0], memory
+
+
+@pytest.fixture
+def memory(first_build):
+    copied = Memory()
+    copied.entries = dict(first_build[1].entries)
+    return copied
+
+
+def test_the_second_build_takes_all_but_refinement_from_the_cache(events, built, memory):
+    again, missed, cached = rebuilt(events, CONFIG, memory)
+    assert again.rlm_bytes == built.rlm_bytes
+    assert again.report["line_count"] == built.report["line_count"]
+    assert again.report["event_count"] == built.report["event_count"]
+    assert missed == []
+    assert cached == set(MAPPING_STAGES) - {"refine", "trim"}
+    assert again.report["seconds"]["detect"] == 0.0
+
+
+def test_filling_a_cache_changes_no_byte(built, first_build):
+    assert first_build[0].rlm_bytes == built.rlm_bytes
+
+
+def test_sampled_matches_are_cached_with_the_first_lines(events):
+    memory, config = Memory(), preset("paper")
+    first, _, _ = rebuilt(events, config, memory)
+    again, missed, cached = rebuilt(events, config, memory)
+    assert again.rlm_bytes == first.rlm_bytes
+    assert (missed, cached) == ([], set(MAPPING_STAGES) - {"refine", "trim"})
+
+
+def changed(table, **fields):
+    return dataclasses.replace(
+        CONFIG, **{table: dataclasses.replace(getattr(CONFIG, table), **fields)}
+    )
+
+
+@pytest.mark.parametrize(
+    ("config", "begins_with"),
+    [
+        (changed("trim", min_length_m=0.1), None),
+        (changed("refine", iteration_count=9), "match_global"),
+        (changed("refine", direction_sigma_deg=1.0), "match_global"),
+        (changed("match_global", min_overlap=0.55), "match_global"),
+        (changed("refine", event_weight=2.0), "triangulate"),
+        (changed("triangulate", min_inlier_count=6), "triangulate"),
+        (changed("match_local", min_overlap=0.4), "triangulate"),
+    ],
+)
+def test_a_rebuild_begins_with_the_first_stage_that_reads_what_changed(
+    events, memory, config, begins_with
+):
+    _, missed, _ = rebuilt(events, config, memory)
+    assert missed[:1] == ([begins_with] if begins_with else [])
+
+
+def test_a_rebuild_with_other_parameters_is_what_a_fresh_build_is(events, memory):
+    config = changed("refine", iteration_count=9)
+    fresh = build_map(Pieces(events, 5000), wireframe.trajectory(), wireframe.CAMERA, config)
+    assert rebuilt(events, config, memory)[0].rlm_bytes == fresh.rlm_bytes
+
+
+def test_a_preview_is_a_map_of_the_same_recording(events, built):
+    previews = []
+    source, poses, camera = Pieces(events, 5000), wireframe.trajectory(), wireframe.CAMERA
+    whole = build_map(source, poses, camera, CONFIG, on_preview=previews.append)
+    assert whole.rlm_bytes == built.rlm_bytes
+    (preview,) = previews
+    assert len(preview.line_map) >= 4
+    ends = preview.line_map.segments.reshape(-1, 3)
+    assert distance_to_bars_m(ends).max() < 0.1
+    assert decode_map(preview.rlm_bytes).provenance == decode_map(built.rlm_bytes).provenance
+
+
 def test_a_child_builds_the_same_file_from_stored_bytes(events, built, tmp_path):
     chunks = [encode_chunk(chunk) for chunk in Pieces(events, 10_000).chunks()]
     event_file, pose_file = tmp_path / "events", tmp_path / "poses"
