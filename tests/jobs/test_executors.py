@@ -9,6 +9,7 @@ from roel_service.jobs.executors import InlineExecutor, ProcessExecutor
 from roel_service.jobs.faults import FaultError
 from roel_service.jobs.task import Limits, Partial, TaskSpec, Usage
 from roel_service.jobs.warm import WarmExecutor
+from roel_service.progress import Progress
 
 MIB = 2**20
 
@@ -96,7 +97,8 @@ class TestContract:
             started = asyncio.Event()
 
             async def note(news):
-                started.set()
+                if isinstance(news, Progress):
+                    started.set()
 
             task = asyncio.create_task(executor.run(spec("tick", ticks), note))
             await started.wait()

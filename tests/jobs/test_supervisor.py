@@ -8,6 +8,7 @@ import pytest
 
 from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.task import TaskSpec
+from roel_service.progress import Progress
 
 
 def spec(name, parameters=None):
@@ -19,7 +20,8 @@ async def run(name, parameters=None):
     stages = []
 
     async def note(news):
-        stages.append(news.stage)
+        if isinstance(news, Progress):
+            stages.append(news.stage)
 
     return await ProcessExecutor(1).run(spec(name, parameters), note), stages
 
@@ -65,6 +67,7 @@ FRONT = """
 import asyncio, sys
 from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.task import TaskSpec
+from roel_service.progress import Progress
 
 async def note(progress):
     print("started", flush=True)
