@@ -51,8 +51,9 @@ def test_cancelling_ends_the_child(name):
     async def cancel_when_it_sleeps():
         started = asyncio.Event()
 
-        async def note(progress):
-            started.set()
+        async def note(news):
+            if isinstance(news, Progress):
+                started.set()
 
         task = asyncio.create_task(ProcessExecutor(1).run(spec(name), note))
         await started.wait()
@@ -69,8 +70,9 @@ from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.task import TaskSpec
 from roel_service.progress import Progress
 
-async def note(progress):
-    print("started", flush=True)
+async def note(news):
+    if isinstance(news, Progress):
+        print("started", flush=True)
 
 if __name__ == "__main__":
     spec = TaskSpec(entrypoint="sample_tasks:tell_pid", parameters=sys.argv[1])

@@ -66,7 +66,7 @@ def call(connection):
 
     def called(method, **fields):
         request = getattr(operations_pb2, f"{method}Request")(**fields)
-        return connection.call(getattr(stub, method), request)
+        return connection.call(getattr(stub, method), request, timeout_s=60.0)
 
     return called
 
