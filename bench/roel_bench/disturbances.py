@@ -149,12 +149,13 @@ def with_noisy_poses(scene: Scene, seed: int) -> Scene:
 
 Disturbance = Callable[[Scene, int], Scene]
 
+NOISY_POSES = "noisy_poses"
 DISTURBANCES: dict[str, Disturbance] = {
     "noise_events": with_noise,
     "uneven_thresholds": with_uneven_thresholds,
     "low_light": with_low_light,
     "fast_motion": with_fast_motion,
-    "noisy_poses": with_noisy_poses,
+    NOISY_POSES: with_noisy_poses,
 }
 
 

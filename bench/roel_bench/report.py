@@ -16,7 +16,7 @@ from roel_bench.catalogue import (
     TUNING_ROOMS,
     TUNING_SEEDS,
 )
-from roel_bench.disturbances import DISTURBANCES
+from roel_bench.disturbances import DISTURBANCES, NOISY_POSES
 from roel_bench.methods import PEERS
 from roel_bench.results import NO_DISTURBANCE, Results, Row, read_results
 from roel_bench.suites import FRONT_END, MAP, PRESET_NAMES
@@ -31,7 +31,7 @@ from roel_bench.tables import (
     table,
     write_text,
 )
-from roel_bench.variants import Variant
+from roel_bench.variants import REFINED_POSES, Variant
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "bench" / "results" / "mapping.json"
@@ -208,11 +208,15 @@ def _noise(report: _Report) -> str:
         scenes.update(rows)
         kept = report.maps.ratio("iou_20", "default", "default", disturbance)
         lines.append([*_map_line(disturbance, rows.values()), number(kept, 2)])
+    refined = report.maps.rows(REFINED_POSES.name, disturbance=NOISY_POSES)
+    kept = report.maps.ratio("iou_20", REFINED_POSES.name, "default", NOISY_POSES)
+    lines.append([*_map_line(f"{NOISY_POSES}, refined", refined.values()), number(kept, 2)])
     undisturbed = _default_line(report, "undisturbed", scenes)
     text = (
         "The default on disturbed recordings, mean over all rooms: 15 % noise events, uniform in"
         " space and time; pixels whose threshold is higher by a factor drawn anew for each; 30 %"
-        " of the events; the same motion in half the time; poses of a visual odometry."
+        " of the events; the same motion in half the time; poses of a visual odometry,"
+        " as they are and refined (`--refine-poses`)."
     )
     headings = ["disturbance", *MAP_HEADINGS, "IoU 20 kept"]
     return _section("Noise", text, table(headings, [[*undisturbed, "1.00"], *lines]))

@@ -14,10 +14,16 @@ from roel_bench.catalogue import (
     TINY_ROOM,
     TUNING_ROOMS,
 )
-from roel_bench.disturbances import DISTURBANCES
+from roel_bench.disturbances import DISTURBANCES, NOISY_POSES
 from roel_bench.methods import PEERS
 from roel_bench.results import NO_DISTURBANCE
-from roel_bench.variants import FRONT_END_VARIANTS, MAP_ABLATION, PRESET_VARIANTS, Variant
+from roel_bench.variants import (
+    FRONT_END_VARIANTS,
+    MAP_ABLATION,
+    PRESET_VARIANTS,
+    REFINED_POSES,
+    Variant,
+)
 from roel_service.errors import InputError
 
 MAP, FRONT_END = "map", "front_end"
@@ -60,6 +66,7 @@ ABLATION_SUITE = _cells(MAP, REPORTING_ROOMS, ["default", "paper", *_names(MAP_A
 NOISE_SUITE = [
     *_cells(MAP, REPORTING_ROOMS, ["default"]),
     *(cell for name in DISTURBANCES for cell in _cells(MAP, REPORTING_ROOMS, ["default"], name)),
+    *_cells(MAP, REPORTING_ROOMS, [REFINED_POSES.name], NOISY_POSES),
 ]
 FRONT_END_SUITE = _cells(FRONT_END, FRONT_END_ROOMS, _names(FRONT_END_VARIANTS))
 PEERS_SUITE = _cells(MAP, TUNING_ROOMS + REPORTING_ROOMS, ["default", *PEERS])

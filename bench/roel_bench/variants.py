@@ -43,6 +43,9 @@ def _paper(name: str, **changes: dict[str, Any]) -> Variant:
 
 PRESET_VARIANTS = tuple(Variant(name=name, preset=name) for name in PRESETS)
 
+# For recordings whose poses are an odometry's.
+REFINED_POSES = Variant(name="default with refined poses", changes={"refine": {"free_poses": True}})
+
 NO_PLANES = {"method": "none"}
 NO_STEPS = {"iteration_count": 0}
 NO_MERGING = {"merge_distance_px": 0.0}
@@ -223,7 +226,8 @@ FRONT_END_VARIANTS = (
 )
 
 VARIANTS = {
-    variant.name: variant for variant in (*PRESET_VARIANTS, *MAP_ABLATION, *FRONT_END_VARIANTS)
+    variant.name: variant
+    for variant in (*PRESET_VARIANTS, REFINED_POSES, *MAP_ABLATION, *FRONT_END_VARIANTS)
 }
 
 

@@ -3,7 +3,8 @@ import pytest
 from roel_bench import report
 from roel_bench.acceptance import CRITERIA, Maps
 from roel_bench.catalogue import LARGE_ROOMS, SMALL_ROOMS
-from roel_bench.results import Results, read_results, write_results
+from roel_bench.disturbances import NOISY_POSES
+from roel_bench.results import NO_DISTURBANCE, Results, read_results, write_results
 from roel_bench.suites import FRONT_END
 from roel_bench.variants import DEFAULT_ABLATION, VARIANTS
 from tests.bench.samples import row
@@ -119,10 +120,17 @@ def test_newest_row_of_a_cell_counts():
 
 def test_every_variant_is_told_of():
     """A row that nobody reads is not worth its time."""
+    cells = [("map", NO_DISTURBANCE), ("map", NOISY_POSES), (FRONT_END, NO_DISTURBANCE)]
     rows = [
-        row(LARGE, method=name, task=task, figures=figures(0.01 * k) | {"f_score": 0.01 * k})
+        row(
+            LARGE,
+            method=name,
+            task=task,
+            disturbance=disturbance,
+            figures=figures(0.01 * k) | {"f_score": 0.01 * k},
+        )
         for k, name in enumerate(VARIANTS)
-        for task in ("map", FRONT_END)
+        for task, disturbance in cells
     ]
     with_all = report.document(Results(machine=RESULTS.machine, versions={}, rows=tuple(rows)))
     for missing in VARIANTS:
