@@ -1,7 +1,8 @@
 """The text of config.proto, made from the dataclasses of `roel_service.config.stages`.
 
-One message for each table. Field numbers follow the order of the dataclass, so before a release
-any order is fine, and after it fields are added at the end (`buf breaking` guards that).
+One message for each table. Field numbers stand in `config_numbers.json`, which only grows: a field
+keeps its number wherever it stands in its dataclass, a new one gets the next, and the number and name
+of one that is gone are reserved for ever.
 """
 
 from __future__ import annotations
@@ -50,30 +51,64 @@ FIELD_TYPES: dict[Any, str] = {
 }
 
 
-def config_proto() -> str:
-    """The whole file."""
-    tables = [(item.name, item.default) for item in dataclasses.fields(Config)]
-    messages = [HEADER, _mapping_config(tables)]
-    messages += [_table_message(type(default)) for _, default in tables]
+# Message and field name to field number.
+Numbers = dict[str, dict[str, int]]
+
+
+def config_proto(numbers: Numbers) -> str:
+    """The whole file, with numbers of `grown_numbers`."""
+    tables = _tables()
+    fields = [
+        (name, type(default).__name__, [f"  // {_summary(type(default))}"])
+        for name, default in tables
+    ]
+    comment = "Every parameter of a build; absent tables and fields keep the preset's value."
+    messages = [HEADER, _message("MappingConfig", comment, fields, numbers["MappingConfig"])]
+    messages += [_table_message(type(default), numbers) for _, default in tables]
     return "\n".join(messages)
 
 
-def _mapping_config(tables: list[tuple[str, Any]]) -> str:
-    lines = ["// Every parameter of a build; absent tables and fields keep the preset's value."]
-    lines.append("message MappingConfig {")
-    for number, (name, default) in enumerate(tables, start=1):
-        lines.append(f"  // {_summary(type(default))}")
-        lines.append(f"  {type(default).__name__} {name} = {number};")
-    return "\n".join([*lines, "}", ""])
+def grown_numbers(known: Numbers) -> Numbers:
+    """The numbers that are known, and the next ones for the fields that have none."""
+    tables = _tables()
+    named = {"MappingConfig": [name for name, _ in tables]}
+    for _, default in tables:
+        named[type(default).__name__] = [item.name for item in dataclasses.fields(default)]
+    grown = {message: dict(fields) for message, fields in known.items()}
+    for message, names in named.items():
+        fields = grown.setdefault(message, {})
+        for name in names:
+            fields.setdefault(name, max(fields.values(), default=0) + 1)
+    return grown
 
 
-def _table_message(table: type) -> str:
+def _tables() -> list[tuple[str, Any]]:
+    """Name of each table, and its defaults."""
+    return [(item.name, item.default) for item in dataclasses.fields(Config)]
+
+
+def _table_message(table: type, numbers: Numbers) -> str:
     types = get_type_hints(table)
     comments = dict(_attribute_comments(table.__doc__ or ""))
-    lines = [f"// {_summary(table)}", f"message {table.__name__} {{"]
-    for number, item in enumerate(dataclasses.fields(table), start=1):
-        lines += _comment(comments[item.name])
-        lines.append(f"  {FIELD_TYPES[types[item.name]]} {item.name} = {number};")
+    fields = [
+        (item.name, FIELD_TYPES[types[item.name]], _comment(comments[item.name]))
+        for item in dataclasses.fields(table)
+    ]
+    return _message(table.__name__, _summary(table), fields, numbers[table.__name__])
+
+
+def _message(
+    name: str, comment: str, fields: list[tuple[str, str, list[str]]], numbers: dict[str, int]
+) -> str:
+    """A message of fields, each a name, a type and lines of comment."""
+    gone = sorted(set(numbers) - {field for field, _, _ in fields}, key=numbers.__getitem__)
+    lines = [f"// {comment}", f"message {name} {{"]
+    if gone:
+        lines.append(f"  reserved {', '.join(str(numbers[field]) for field in gone)};")
+        quoted = [f'"{field}"' for field in gone]
+        lines.append(f"  reserved {', '.join(quoted)};")
+    for field, kind, comments in fields:
+        lines += [*comments, f"  {kind} {field} = {numbers[field]};"]
     return "\n".join([*lines, "}", ""])
 
 

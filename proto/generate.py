@@ -2,7 +2,8 @@
 
     python proto/generate.py [--root DIR]
 
-1. `config.proto` from the configuration's dataclasses;
+1. `config.proto` from the configuration's dataclasses, and `config_numbers.json` beside this file,
+   which keeps the numbers of its fields for ever;
 2. `build/proto`, the third-party sources that protoc and buf need beside ours;
 3. `roel_service/v1`, the messages and stubs, which are committed.
 """
@@ -10,12 +11,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shutil
 import sys
 from importlib.resources import files
 from pathlib import Path
 
-from config_proto import config_proto
+from config_proto import config_proto, grown_numbers
 from grpc_tools import protoc
 
 HERE = Path(__file__).resolve().parent
@@ -49,7 +51,10 @@ def write_sources(root: Path) -> Path:
     sources = root / "proto"
     if sources != HERE:
         shutil.copytree(HERE, sources, ignore=shutil.ignore_patterns("__pycache__"))
-    (sources / PACKAGE / "config.proto").write_text(config_proto(), encoding="utf-8")
+    table = sources / "config_numbers.json"
+    numbers = grown_numbers(json.loads(table.read_text(encoding="utf-8")))
+    table.write_text(json.dumps(numbers, indent=1) + "\n", encoding="utf-8")
+    (sources / PACKAGE / "config.proto").write_text(config_proto(numbers), encoding="utf-8")
     return sources
 
 
