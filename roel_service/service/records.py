@@ -159,6 +159,5 @@ _TARGETS: dict[OperationMethod, Callable[[OperationRecord], str]] = {
 
 
 def _timestamp(time_us: int) -> Timestamp:
-    timestamp = Timestamp()
-    timestamp.FromMicroseconds(time_us)
-    return timestamp
+    seconds, us = divmod(time_us, 1_000_000)
+    return Timestamp(seconds=seconds, nanos=1000 * us)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, RowMapping, delete, exists, func, insert, select, update
+from sqlalchemy import Connection, Select, delete, exists, func, insert, select, update
 
 from roel_service.errors import ConflictError, NotFoundError, StateError
 from roel_service.store.records import (
@@ -38,33 +39,41 @@ def get_map(connection: Connection, map_id: str) -> MapRecord:
 
 def find_map(connection: Connection, map_id: str) -> MapRecord:
     """One map, also a deleted one; raises `NotFoundError`."""
-    rows = connection.execute(select(MAP).where(MAP.c.id == map_id)).mappings().all()
-    if not rows:
+    records = map_records(connection, select(MAP).where(MAP.c.id == map_id))
+    if not records:
         raise NotFoundError("map", "an existing one", map_id)
-    return map_records(connection, rows)[0]
+    return records[0]
 
 
-def map_records(connection: Connection, rows: Sequence[RowMapping]) -> list[MapRecord]:
-    """Rows of maps, in the order of their ids, with the aliases that all of them have."""
+def map_records(connection: Connection, query: Select[Any]) -> list[MapRecord]:
+    """The maps of a query for whole rows in the order of ids, with their aliases."""
+    # By position: a mapping for each row would take as long as all the rest.
+    names = MAP.c.keys()
+    rows = [dict(zip(names, row, strict=True)) for row in connection.execute(query)]
     if not rows:
         return []
-    aliases: dict[str, dict[str, int]] = {row["id"]: {} for row in rows}
-    first, last = rows[0]["id"], rows[-1]["id"]
+    aliases = _aliases_between(connection, rows[0]["id"], rows[-1]["id"])
+    for row in rows:
+        row["labels"] = json.loads(row["labels"])
+        row["aliases"] = aliases.get(row["id"], {})
+    return [MapRecord(**row) for row in rows]
+
+
+def _aliases_between(connection: Connection, first: str, last: str) -> dict[str, dict[str, int]]:
+    """Aliases of every map whose id lies between two, with the newest usable version."""
     chosen = select(MAP_ALIAS.c.map_id, MAP_ALIAS.c.alias, MAP_ALIAS.c.version)
     newest = select(MAP_VERSION.c.map_id, func.max(MAP_VERSION.c.version)).where(
         MAP_VERSION.c.map_id.between(first, last),
         MAP_VERSION.c.state.in_([state.value for state in USABLE]),
     )
+    aliases: dict[str, dict[str, int]] = defaultdict(dict)
     for map_id, alias, version in connection.execute(
         chosen.where(MAP_ALIAS.c.map_id.between(first, last)).order_by(MAP_ALIAS.c.alias)
     ):
-        aliases.get(map_id, {})[alias] = version
+        aliases[map_id][alias] = version
     for map_id, version in connection.execute(newest.group_by(MAP_VERSION.c.map_id)):
-        aliases.get(map_id, {})[LATEST] = version
-    return [
-        MapRecord(**{**row, "labels": json.loads(row["labels"]), "aliases": aliases[row["id"]]})
-        for row in rows
-    ]
+        aliases[map_id][LATEST] = version
+    return aliases
 
 
 def get_version(connection: Connection, record: MapRecord, label: int | str) -> MapVersionRecord:

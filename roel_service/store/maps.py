@@ -98,7 +98,7 @@ class Maps:
         if not show_deleted:
             query = query.where(MAP.c.delete_time_us == 0)
         with self._database.read() as connection:
-            return map_records(connection, connection.execute(query).mappings().all())
+            return map_records(connection, query)
 
     def update(
         self, map_id: str, values: dict[str, Any], etag: str, request: RequestId | None
