@@ -66,6 +66,7 @@ class MapFile:
         provenance: what the map was made of.
         frame_id: name of the frame of the coordinates.
         bounds_min_m, bounds_max_m: (3,) box around the lines before rounding.
+        step_m: of the grid that coordinates were rounded to; they are off by at most half of it.
         dropped_line_count: lines left out because their ends fell on one step.
         format_version: major and minor.
         byte_count: size of the file.
@@ -77,6 +78,7 @@ class MapFile:
     frame_id: str
     bounds_min_m: FloatArray
     bounds_max_m: FloatArray
+    step_m: float
     dropped_line_count: int
     format_version: tuple[int, int]
     byte_count: int
@@ -165,6 +167,7 @@ def decode_map(data: bytes, *, subject: str = "map file") -> MapFile:
             frame_id=header.frame_id,
             bounds_min_m=lower,
             bounds_max_m=upper,
+            step_m=opened.grid.step,
             dropped_line_count=header.dropped_line_count,
             format_version=opened.format_version,
             byte_count=len(data),
