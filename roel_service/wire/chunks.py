@@ -21,8 +21,8 @@ from roel_service.scene.events import EventSource, EventStream, concatenate
 from roel_service.wire.byte_planes import (
     integers_from_planes,
     largest_of_planes,
-    planes_from_integers,
     sum_of_planes,
+    write_planes,
 )
 
 MAX_CHUNK_EVENT_COUNT = 131_072
@@ -71,8 +71,9 @@ class _Header(NamedTuple):
 
 
 class _Planes(NamedTuple):
-    """The parts of a payload, uint8 each: planes of three columns, and polarity bits."""
+    """A payload and its parts, uint8 each: planes of three columns, and polarity bits."""
 
+    all: Array
     steps: Array
     x: Array
     y: Array
@@ -112,25 +113,14 @@ def split_chunks(source: EventSource) -> Iterator[EventStream]:
             start = jump
         stop = start + (len(events) - start) // MAX_CHUNK_EVENT_COUNT * MAX_CHUNK_EVENT_COUNT
         yield from _pieces(events, start, stop)
-        rest = _part(events, stop, len(events)) if stop < len(events) else None
+        rest = events.part(stop, len(events)) if stop < len(events) else None
     if rest is not None:
         yield rest
 
 
 def _pieces(events: EventStream, start: int, stop: int) -> Iterator[EventStream]:
     for first in range(start, stop, MAX_CHUNK_EVENT_COUNT):
-        yield _part(events, first, min(first + MAX_CHUNK_EVENT_COUNT, stop))
-
-
-def _part(events: EventStream, start: int, stop: int) -> EventStream:
-    return EventStream(
-        t_us=events.t_us[start:stop],
-        x=events.x[start:stop],
-        y=events.y[start:stop],
-        polarity=events.polarity[start:stop],
-        width=events.width,
-        height=events.height,
-    )
+        yield events.part(first, min(first + MAX_CHUNK_EVENT_COUNT, stop))
 
 
 def encode_chunk(events: EventStream) -> bytes:
@@ -148,15 +138,14 @@ def encode_chunk(events: EventStream) -> bytes:
     if longest_us > MAX_STEP_US:
         raise _malformed(f"steps of at most {MAX_STEP_US} us", f"{longest_us} us")
     width_bytes = 2 if longest_us < 2**16 else 4
-    planes = (
-        planes_from_integers(steps_us.astype(f"u{width_bytes}"), width_bytes),
-        planes_from_integers(events.x, 2),
-        planes_from_integers(events.y, 2),
-        np.packbits(events.polarity > 0, bitorder="little").tobytes(),
-    )
-    payload = zstandard.ZstdCompressor(compression_params=_ZSTD_PARAMETERS).compress(
-        b"".join(planes)
-    )
+    payload_bytes = _payload_bytes(width_bytes, count)
+    planes = _parted(np.empty(payload_bytes, np.uint8), width_bytes, count)
+    write_planes(steps_us.astype(f"u{width_bytes}"), width_bytes, planes.steps)
+    write_planes(events.x, 2, planes.x)
+    write_planes(events.y, 2, planes.y)
+    planes.signs[:] = np.packbits(events.polarity > 0, bitorder="little")
+    compressor = zstandard.ZstdCompressor(compression_params=_ZSTD_PARAMETERS)
+    payload = compressor.compress(planes.all.data)
     header = _HEADER.pack(
         *_Header(
             magic=_MAGIC,
@@ -232,10 +221,19 @@ def _opened(data: bytes) -> tuple[_Header, _Planes]:
     if header.payload_length != len(payload):
         raise _malformed(f"a payload of {header.payload_length} bytes", f"{len(payload)}")
     _check_crc("payload", payload, header.payload_crc)
-    width_bytes, count = header.width_bytes, header.event_count
-    ends = np.cumsum([width_bytes * count, 2 * count, 2 * count, -(-count // 8)])
-    planes = _decompressed(payload, int(ends[-1]))
-    return header, _Planes(*np.split(planes, ends[:-1]))
+    size = _payload_bytes(header.width_bytes, header.event_count)
+    decompressed = _decompressed(payload, size)
+    return header, _parted(decompressed, header.width_bytes, header.event_count)
+
+
+def _payload_bytes(width_bytes: int, count: int) -> int:
+    return (width_bytes + 4) * count + -(-count // 8)
+
+
+def _parted(payload: Array, width_bytes: int, count: int) -> _Planes:
+    """A decompressed payload with views of its parts."""
+    ends = np.cumsum([width_bytes * count, 2 * count, 2 * count])
+    return _Planes(payload, *np.split(payload, ends))
 
 
 def _is_sound(header: _Header, planes: _Planes) -> bool:
