@@ -19,12 +19,12 @@ from google.longrunning import operations_pb2, operations_pb2_grpc
 from roel_client.connection import AsyncConnection, Endpoint, Tls
 from roel_client.embedded import async_served
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
-from roel_client.uploads import BlobDownload, BlobUpload, EventUpload
+from roel_client.uploads import BlobDownload, BlobUpload, EventUpload, events_of_chunk
 from roel_service.config.stages import Config
 from roel_service.errors import CorruptionError, RoelError
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventSource
+from roel_service.scene.events import EventSlice, EventSource
 from roel_service.scene.trajectory import Trajectory
 from roel_service.v1 import (
     blobs_pb2,
@@ -177,6 +177,22 @@ class AsyncClient:
         """What the server has of a recording."""
         request = events_pb2.GetEventStreamRequest(name=name)
         return await self._connection.call(self._streams.GetEventStream, request)
+
+    async def read_events(
+        self, name: str, start_us: int | None = None, stop_us: int | None = None
+    ) -> AsyncIterator[EventSlice]:
+        """Events start_us <= t < stop_us of a recording, in pieces; by default all of them."""
+        request = events_pb2.ReadEventsRequest(name=name, start_us=start_us, stop_us=stop_us)
+        chunks = self._connection.stream(self._streams.ReadEvents, request)
+        async with contextlib.aclosing(chunks):
+            async for chunk in chunks:
+                yield await self._connection.run(events_of_chunk, chunk, start_us, stop_us)
+
+    async def preview_events(self, name: str, start_us: int, stop_us: int) -> bytes:
+        """A picture of the events start_us <= t < stop_us, as a PNG file."""
+        request = events_pb2.PreviewEventsRequest(name=name, start_us=start_us, stop_us=stop_us)
+        answer = await self._connection.call(self._streams.PreviewEvents, request)
+        return bytes(answer.png)
 
     async def delete_event_stream(self, name: str) -> None:
         """Delete a recording."""

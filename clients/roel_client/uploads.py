@@ -1,4 +1,4 @@
-"""Uploads as state machines without input or output: what to send next, and what is durable.
+"""Uploads and downloads as state machines: what to send next, and what is durable.
 
 They survive broken calls. What is under way is bounded by the server's credit; what is not
 acknowledged is kept, so that nothing is encoded twice and nothing acknowledged is sent again.
@@ -17,10 +17,10 @@ from pathlib import Path
 from roel_service.errors import CorruptionError, UnavailableError
 from roel_service.in_order import in_order
 from roel_service.progress import Progress, ProgressCallback
-from roel_service.scene.events import EventSource, EventStream
+from roel_service.scene.events import EventSlice, EventSource, EventStream
 from roel_service.v1 import blobs_pb2, events_pb2, types_pb2
 from roel_service.wire import names
-from roel_service.wire.chunks import encode_chunk, split_chunks
+from roel_service.wire.chunks import decode_chunk, encode_chunk, split_chunks
 
 # More threads than this would encode faster than any server checks.
 MAX_ENCODER_COUNT = 4
@@ -215,3 +215,14 @@ class BlobDownload:
     def close(self) -> None:
         """Leave nothing half behind."""
         self._part.unlink(missing_ok=True)
+
+
+def events_of_chunk(
+    chunk: events_pb2.EventChunk, start_us: int | None, stop_us: int | None
+) -> EventSlice:
+    """The events of a chunk that lie in a time range; it may be open on either side."""
+    events = decode_chunk(chunk.data, previous_t1_us=None)
+    first_us, last_us = int(events.t_us[0]), int(events.t_us[-1])
+    return events.between(
+        first_us if start_us is None else start_us, last_us + 1 if stop_us is None else stop_us
+    )

@@ -32,6 +32,16 @@ class EventSlice:
     def __len__(self) -> int:
         return len(self.t_us)
 
+    def first(self, count: int) -> EventSlice:
+        """At most so many events from the start, without a copy."""
+        return EventSlice(
+            t_us=self.t_us[:count],
+            x=self.x[:count],
+            y=self.y[:count],
+            polarity=self.polarity[:count],
+            t_ref_us=self.t_ref_us,
+        )
+
     def xyt(self, time_scale_px_per_ms: float) -> FloatArray:
         """(K, 3) space-time points in px; the only place where time becomes a float."""
         t_ms = (self.t_us - self.t_ref_us) * 1e-3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from itertools import islice
 from typing import Any
 
 from google.protobuf.empty_pb2 import Empty
@@ -18,12 +19,17 @@ from roel_service.store.event_streams import EventStreams, PosePart
 from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import events_pb2, types_pb2
 from roel_service.wire import names
+from roel_service.wire.chunks import decode_chunk
 from roel_service.wire.nouns import (
     camera_from_proto,
     trajectory_columns,
     trajectory_from_proto,
     trajectory_to_proto,
 )
+from roel_service.wire.preview import EventPicture
+
+# Chunks may be small; reading them is what takes the time then.
+MAX_PREVIEW_CHUNK_COUNT = 256
 
 
 class EventStreamServicer:
@@ -33,6 +39,7 @@ class EventStreamServicer:
         self._streams = streams
         self._uploads = uploads
         self._settings = settings
+        self._drawing = asyncio.Lock()
 
     async def CreateEventStream(
         self, request: events_pb2.CreateEventStreamRequest, context: Any
@@ -58,8 +65,7 @@ class EventStreamServicer:
     async def QueryAppendStatus(
         self, request: events_pb2.QueryAppendStatusRequest, context: Any
     ) -> events_pb2.AppendStatus:
-        stream_id = names.event_stream_id(request.name)
-        record = await asyncio.to_thread(self._streams.get, stream_id)
+        record = await self._record(request.name)
         sink = EventSink(self._streams, record, self._settings)
         return await asyncio.to_thread(sink.status)
 
@@ -78,6 +84,25 @@ class EventStreamServicer:
         record = await asyncio.to_thread(self._append_poses, stream_id, parts)
         return event_stream_to_proto(record)
 
+    async def ReadEvents(
+        self, request: events_pb2.ReadEventsRequest, context: Any
+    ) -> AsyncIterator[events_pb2.EventChunk]:
+        record = await self._record(request.name)
+        start_us = request.start_us if request.HasField("start_us") else record.start_us
+        stop_us = request.stop_us if request.HasField("stop_us") else record.end_us + 1
+        with self._streams.reading(record) as reader:
+            chunks = reader.chunks(start_us, stop_us)
+            while (chunk := await asyncio.to_thread(next, chunks, None)) is not None:
+                yield events_pb2.EventChunk(seq=chunk.seq, data=chunk.data)
+
+    async def PreviewEvents(
+        self, request: events_pb2.PreviewEventsRequest, context: Any
+    ) -> events_pb2.PreviewEventsResponse:
+        record = await self._record(request.name)
+        # One at a time: the front has other things to do.
+        async with self._drawing:
+            return await asyncio.to_thread(self._preview, record, request.start_us, request.stop_us)
+
     async def FinalizeEventStream(
         self, request: events_pb2.FinalizeEventStreamRequest, context: Any
     ) -> events_pb2.EventStream:
@@ -87,8 +112,7 @@ class EventStreamServicer:
     async def GetEventStream(
         self, request: events_pb2.GetEventStreamRequest, context: Any
     ) -> events_pb2.EventStream:
-        stream_id = names.event_stream_id(request.name)
-        return event_stream_to_proto(await asyncio.to_thread(self._streams.get, stream_id))
+        return event_stream_to_proto(await self._record(request.name))
 
     async def ListEventStreams(
         self, request: events_pb2.ListEventStreamsRequest, context: Any
@@ -106,6 +130,26 @@ class EventStreamServicer:
     ) -> Empty:
         await asyncio.to_thread(self._streams.delete, names.event_stream_id(request.name))
         return Empty()
+
+    async def _record(self, name: str) -> EventStreamRecord:
+        return await asyncio.to_thread(self._streams.get, names.event_stream_id(name))
+
+    def _preview(
+        self, record: EventStreamRecord, start_us: int, stop_us: int
+    ) -> events_pb2.PreviewEventsResponse:
+        picture = EventPicture(record.camera.width, record.camera.height)
+        left_count = self._settings.preview_event_count
+        with self._streams.reading(record) as reader:
+            for chunk in islice(reader.chunks(start_us, stop_us), MAX_PREVIEW_CHUNK_COUNT):
+                events = decode_chunk(chunk.data, previous_t1_us=None).between(start_us, stop_us)
+                drawn = events.first(left_count)
+                picture.add(drawn)
+                left_count -= len(drawn)
+                if left_count == 0:
+                    break
+        return events_pb2.PreviewEventsResponse(
+            png=picture.png(), event_count=self._settings.preview_event_count - left_count
+        )
 
     async def _stream_id(self, requests: AsyncIterator[Any]) -> str:
         """The recording that the first message of an upload names."""

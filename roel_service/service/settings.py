@@ -29,6 +29,7 @@ class Settings:
         task_time_s: wall clock of one attempt.
         retry_delay_s: mean time before a lost or broken attempt is tried again; it doubles.
         append_credit_chunks: event chunks of a call that may be under way at a time.
+        preview_event_count: most events of a picture; they are counted in the front.
         blob_bytes, blob_part_bytes: largest blob that is uploaded, and part of it.
         blob_credit_bytes: bytes of a call that may be under way.
         open_uploads: uploads at a time.
@@ -63,6 +64,7 @@ class Settings:
     task_time_s: float = 3600.0
     retry_delay_s: float = 1.0
     append_credit_chunks: int = 16
+    preview_event_count: int = 1_000_000
     blob_bytes: int = 10 * GIB
     blob_part_bytes: int = MIB
     blob_credit_bytes: int = 8 * MIB

@@ -6,7 +6,8 @@ import dataclasses
 import itertools
 import json
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from roel_service.failpoints import failpoint
 from roel_service.scene.camera import Camera
 from roel_service.scene.trajectory import MAX_POSE_GAP_US
 from roel_service.store.blobs import BlobStore
+from roel_service.store.chunk_reader import ChunkReader
 from roel_service.store.database import Database
 from roel_service.store.locks import KeyedLocks
 from roel_service.store.recordings import Recordings
@@ -245,6 +247,24 @@ class EventStreams:
         """The pose parts of a recording, in the order of time."""
         with self._database.read() as connection:
             return [self._blobs.path(row["sha256"]) for row in _pose_rows(connection, record.uid)]
+
+    @contextmanager
+    def reading(self, record: EventStreamRecord) -> Iterator[ChunkReader]:
+        """The durable chunks of a recording, for as long as the block lasts.
+
+        Raises:
+            NotFoundError: it was deleted meanwhile.
+        """
+        path = self._recordings.path(record.uid)
+        if record.state is StreamState.FINALIZED:
+            path = self._blobs.path(record.digest)
+        try:
+            file = path.open("rb")
+        except FileNotFoundError:
+            # It was frozen between the two looks, or is gone.
+            file = self._blobs.path(self.get(record.id).digest).open("rb")
+        with file:
+            yield ChunkReader(self._database, record.uid, file)
 
     def covered_us(self, record: EventStreamRecord) -> list[list[int]]:
         """First and last times between which poses are dense enough, in order."""

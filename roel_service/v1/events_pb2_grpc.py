@@ -56,6 +56,16 @@ class EventStreamServiceStub:
                 request_serializer=roel__service_dot_v1_dot_events__pb2.AppendPosesRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_events__pb2.EventStream.FromString,
                 _registered_method=True)
+        self.ReadEvents = channel.unary_stream(
+                '/roel_service.v1.EventStreamService/ReadEvents',
+                request_serializer=roel__service_dot_v1_dot_events__pb2.ReadEventsRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_events__pb2.EventChunk.FromString,
+                _registered_method=True)
+        self.PreviewEvents = channel.unary_unary(
+                '/roel_service.v1.EventStreamService/PreviewEvents',
+                request_serializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.FromString,
+                _registered_method=True)
         self.FinalizeEventStream = channel.unary_unary(
                 '/roel_service.v1.EventStreamService/FinalizeEventStream',
                 request_serializer=roel__service_dot_v1_dot_events__pb2.FinalizeEventStreamRequest.SerializeToString,
@@ -114,6 +124,22 @@ class EventStreamServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReadEvents(self, request, context):
+        """Chunks that hold events of a time range, whole and as they are stored, also of a recording
+        that is still open. Whoever asks cuts the first and the last one: cutting here would mean to
+        decode and encode them, and their bytes could not be compared with what was uploaded.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def PreviewEvents(self, request, context):
+        """A picture of the events of a time range.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def FinalizeEventStream(self, request, context):
         """Freezes a recording; only a frozen one can be mapped. Freezing twice is harmless.
         """
@@ -164,6 +190,16 @@ def add_EventStreamServiceServicer_to_server(servicer, server):
                     servicer.AppendPoses,
                     request_deserializer=roel__service_dot_v1_dot_events__pb2.AppendPosesRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_events__pb2.EventStream.SerializeToString,
+            ),
+            'ReadEvents': grpc.unary_stream_rpc_method_handler(
+                    servicer.ReadEvents,
+                    request_deserializer=roel__service_dot_v1_dot_events__pb2.ReadEventsRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_events__pb2.EventChunk.SerializeToString,
+            ),
+            'PreviewEvents': grpc.unary_unary_rpc_method_handler(
+                    servicer.PreviewEvents,
+                    request_deserializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.SerializeToString,
             ),
             'FinalizeEventStream': grpc.unary_unary_rpc_method_handler(
                     servicer.FinalizeEventStream,
@@ -295,6 +331,60 @@ class EventStreamService:
             '/roel_service.v1.EventStreamService/AppendPoses',
             roel__service_dot_v1_dot_events__pb2.AppendPosesRequest.SerializeToString,
             roel__service_dot_v1_dot_events__pb2.EventStream.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReadEvents(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/roel_service.v1.EventStreamService/ReadEvents',
+            roel__service_dot_v1_dot_events__pb2.ReadEventsRequest.SerializeToString,
+            roel__service_dot_v1_dot_events__pb2.EventChunk.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PreviewEvents(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.EventStreamService/PreviewEvents',
+            roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.SerializeToString,
+            roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

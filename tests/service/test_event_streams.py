@@ -1,6 +1,7 @@
 import dataclasses
 from contextlib import ExitStack
 
+import cv2
 import numpy as np
 import pytest
 
@@ -336,3 +337,40 @@ def test_answers_tell_how_good_the_recording_is(client, call, stream, append):
     assert quality.event_rate_hz == pytest.approx(4 / 0.8)
     assert quality.pose_coverage == pytest.approx(0.5)
     assert quality.longest_gap_us == 450_000
+
+
+def test_a_time_range_is_read_back(client, stream):
+    events = events_of(200_000)
+    client.upload_events(stream, events)
+    whole = [part.t_us for part in client.read_events(stream)]
+    assert len(whole) == 2
+    np.testing.assert_array_equal(np.concatenate(whole), events.t_us)
+    start_us, stop_us = int(events.t_us[120_000]), int(events.t_us[150_000])
+    parts = list(client.read_events(stream, start_us, stop_us))
+    wanted = events.between(start_us, stop_us)
+    for name in ("t_us", "x", "y", "polarity"):
+        found = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(found, getattr(wanted, name))
+    client.finalize(stream)
+    assert list(client.read_events(stream, int(events.t_us[-1]) + 1)) == []
+    assert sum(len(part) for part in client.read_events(stream, stop_us=stop_us)) > 10_000
+
+
+def test_chunks_come_back_as_they_were_sent(connection, stub, append, stream):
+    chunks = [encode_chunk(events) for events in parts_of(events_of(300), 100)]
+    append(header(stream), *(chunk(seq, data) for seq, data in enumerate(chunks)))
+    request = events_pb2.ReadEventsRequest(name=stream)
+    read = [answer.data for answer in connection.stream(stub.ReadEvents, request)]
+    assert read == chunks
+
+
+def test_a_preview_shows_where_events_were(client, call, stream):
+    client.upload_events(stream, events_of(2000))
+    png = client.preview_events(stream, 0, 500_000)
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image.shape == (48, 64, 3)
+    assert image.any()
+    request = events_pb2.PreviewEventsRequest(name=stream, start_us=2_000_000, stop_us=3_000_000)
+    answer = call("PreviewEvents", request)
+    assert answer.event_count == 0
+    assert answer.png.startswith(b"\x89PNG")

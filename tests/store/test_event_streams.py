@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from roel_service.errors import (
     ConflictError,
+    CorruptionError,
     EventsError,
     LimitError,
     NotFoundError,
@@ -231,7 +232,7 @@ def test_bytes_that_were_never_committed_are_cut_away(folder):
 
 
 # Each example opens a folder several times.
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.data())
 def test_any_way_of_sending_gives_the_same_recording(tmp_path_factory, data):
     """However chunks are grouped, repeated and interrupted, what is stored is their sequence."""
@@ -251,3 +252,40 @@ def test_any_way_of_sending_gives_the_same_recording(tmp_path_factory, data):
         record = store.event_streams.finalize("walk")
         content = store.event_streams.event_file(record).read_bytes()
     assert content == b"".join(item.data for item in chunks)
+
+
+def seqs_between(streams, start_us, stop_us):
+    with streams.reading(streams.get("walk")) as reader:
+        return [item.seq for item in reader.chunks(start_us, stop_us)]
+
+
+def test_chunks_of_a_time_range_are_found(streams):
+    """Chunks of 900 us begin every 1000 us; three more share one time."""
+    same = [chunk(seq, t0_us=3000, t1_us=3000) for seq in (3, 4, 5)]
+    append(streams, *(chunk(seq) for seq in range(3)), *same, chunk(6, t0_us=3000))
+    assert seqs_between(streams, -5, 9000) == [0, 1, 2, 3, 4, 5, 6]
+    assert seqs_between(streams, 1900, 1901) == [1]
+    assert seqs_between(streams, 1901, 2000) == []
+    assert seqs_between(streams, 500, 1001) == [0, 1]
+    assert seqs_between(streams, 3000, 3001) == [3, 4, 5, 6]
+    assert seqs_between(streams, 3500, 4000) == [6]
+
+
+def test_a_recording_that_is_frozen_and_deleted_is_read_to_its_end(streams):
+    append(streams, chunk(0, b"one"))
+    record = streams.get("walk")
+    with streams.reading(record) as reader:
+        streams.finalize("walk")
+        assert [item.data for item in reader.chunks(0, 1000)] == [b"one"]
+    with streams.reading(record) as reader:
+        assert [item.data for item in reader.chunks(0, 1000)] == [b"one"]
+    streams.delete("walk")
+    with pytest.raises(NotFoundError), streams.reading(record):
+        pass
+
+
+def test_changed_bytes_are_never_read(streams, folder):
+    uid = append(streams, chunk(0, b"right")).uid
+    (folder / "recordings" / f"{uid}.rec").write_bytes(b"wrong")
+    with pytest.raises(CorruptionError, match="chunk 0"):
+        seqs_between(streams, 0, 1000)
