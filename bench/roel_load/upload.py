@@ -13,16 +13,14 @@ import itertools
 import json
 import os
 import resource
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from roel_client import Client
+from roel_load.servers import served_by
 from roel_service.io.camera import read_camera
 from roel_service.io.events import open_events
 from roel_service.scene.camera import Camera
@@ -76,7 +74,7 @@ def _shifted(chunk: EventStream, offset_us: int, count: int) -> EventStream:
 
 def measure_upload(source: RepeatedRecording, camera: Camera, folder: Path) -> UploadFigures:
     """Upload once to a fresh server."""
-    with _server(folder) as (address, process_id), Client(address) as client:
+    with served_by(folder) as (address, process_id), Client(address) as client:
         stream = client.create_event_stream("recording", camera)
         server_before_s, client_before_s = _cpu_s(process_id), _own_cpu_s()
         start_s = time.perf_counter()
@@ -92,18 +90,6 @@ def measure_upload(source: RepeatedRecording, camera: Camera, folder: Path) -> U
         client_cpu_ns_per_event=(client_s - client_before_s) / count * 1e9,
         server_cpu_ns_per_event=(server_s - server_before_s) / count * 1e9,
     )
-
-
-@contextmanager
-def _server(folder: Path) -> Iterator[tuple[str, int]]:
-    """Address and process id of a server that lasts as long as the block."""
-    command = [sys.executable, "-m", "roel_service.service", "--data", str(folder), "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(process.stdout.readline())["address"], process.pid
-        finally:
-            process.terminate()
 
 
 def _cpu_s(process_id: int) -> float:
