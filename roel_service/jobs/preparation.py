@@ -3,23 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from roel_service.config.stages import Config
 from roel_service.jobs.imports import ImportParameters
 from roel_service.jobs.inputs import (
-    BuildParameters,
     CachePlace,
     FollowParameters,
     sealed_parameters,
 )
+from roel_service.store.garbage import LONGEST_UPLOAD_S
 from roel_service.store.records import OperationRecord, StreamState, TaskRecord
 from roel_service.store.store import CACHE, Store
 from roel_service.v1 import config_pb2
 from roel_service.wire.configs import config_from_proto, config_to_proto
 
-# Entry point and parameters of the work; called in a thread for each attempt.
-Prepare = Callable[[OperationRecord, TaskRecord], tuple[str, Any]]
+
+class Prepared(NamedTuple):
+    """Work for an executor.
+
+    Attributes:
+        waits_s: so long the work may wait for somebody else; its time limit grows by it.
+    """
+
+    entrypoint: str
+    parameters: Any
+    waits_s: float = 0.0
+
+
+# Called in a thread for each attempt.
+Prepare = Callable[[OperationRecord, TaskRecord], Prepared]
 
 
 def build_parameters_to_bytes(config: Config) -> bytes:
@@ -30,11 +43,11 @@ def build_parameters_to_bytes(config: Config) -> bytes:
 def import_preparation(store: Store) -> Prepare:
     """How an import is prepared: the version's row names the file."""
 
-    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, ImportParameters]:
+    def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
         version = store.maps.made_version(operation)
         file = store.maps.imported_path(version)
         parameters = ImportParameters(file=file, sha256=version.imported_file["sha256"])
-        return "roel_service.jobs.imports:run_import", parameters
+        return Prepared("roel_service.jobs.imports:run_import", parameters)
 
     return prepare
 
@@ -50,20 +63,20 @@ def build_preparation(
     """
     cache = CachePlace(folder=store.folder / CACHE, max_bytes=cache_bytes) if cache_bytes else None
 
-    def prepare(
-        operation: OperationRecord, task: TaskRecord
-    ) -> tuple[str, BuildParameters | FollowParameters]:
+    def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
         stream = store.event_streams.get(operation.event_stream_id)
         message = config_pb2.MappingConfig.FromString(task.parameters)
         config = config_from_proto(message, "default")
         if stream.state is StreamState.FINALIZED:
-            return entrypoint, sealed_parameters(store.event_streams, stream, config, cache)
-        return entrypoint, FollowParameters(
+            sealed = sealed_parameters(store.event_streams, stream, config, cache)
+            return Prepared(entrypoint, sealed)
+        followed = FollowParameters(
             folder=store.folder,
             stream_id=stream.id,
             config=config,
             patience_s=patience_s,
             cache=cache,
         )
+        return Prepared(entrypoint, followed, waits_s=LONGEST_UPLOAD_S)
 
     return prepare

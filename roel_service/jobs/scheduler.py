@@ -60,10 +60,10 @@ class Policy:
     time_s: float = 3600.0
     retry_delay_s: float = 1.0
 
-    def limits(self, task: TaskRecord) -> Limits:
-        """Those of the next attempt."""
+    def limits(self, task: TaskRecord, waits_s: float) -> Limits:
+        """Those of the next attempt, which may wait for somebody else."""
         memory_bytes = min(self.memory_bytes << task.memory_doublings, self.max_memory_bytes)
-        return Limits(memory_bytes=memory_bytes, time_s=self.time_s)
+        return Limits(memory_bytes=memory_bytes, time_s=self.time_s + waits_s)
 
     @property
     def max_memory_doublings(self) -> int:
@@ -125,7 +125,8 @@ class Scheduler:
         error = UnavailableError("task", "a worker that finishes", found, reason="WORKER_LOST")
         for operation_id in await asyncio.to_thread(self._operations.without_task):
             await asyncio.to_thread(self._operations.abandon, operation_id, _encoded(error))
-        self._loops = [asyncio.create_task(loop()) for loop in (self._take_tasks, self._renew)]
+        loops = (self._take_tasks, self._renew)
+        self._loops = [asyncio.create_task(self._for_ever(loop)) for loop in loops]
 
     async def submit(self, begin: Begin) -> OperationRecord:
         """Admit an operation.
@@ -170,6 +171,14 @@ class Scheduler:
             record = await asyncio.to_thread(begin)
         self._work.set()
         return record
+
+    async def _for_ever(self, loop: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        while True:
+            try:
+                await loop()
+            except Exception as error:  # the border of the scheduler, which must go on
+                logged_fault(error, "the scheduler")
+                await asyncio.sleep(POLL_INTERVAL_S)
 
     async def _take_tasks(self) -> None:
         while True:
@@ -219,9 +228,9 @@ class Scheduler:
         await self._advance(task, STARTING, metadata)
         operation = await asyncio.to_thread(self._operations.get, task.operation_id)
         prepare = self._prepare[operation.method]
-        entrypoint, parameters = await asyncio.to_thread(prepare, operation, task)
-        limits = self._policy.limits(task)
-        spec = TaskSpec(entrypoint=entrypoint, parameters=parameters, limits=limits)
+        work = await asyncio.to_thread(prepare, operation, task)
+        limits = self._policy.limits(task, work.waits_s)
+        spec = TaskSpec(entrypoint=work.entrypoint, parameters=work.parameters, limits=limits)
         return await self._executor.run(spec, lambda news: self._hear(task, metadata, news))
 
     async def _hear(self, task: TaskRecord, metadata: Metadata, news: News) -> None:

@@ -8,8 +8,15 @@ from google.rpc import status_pb2
 from roel_service.errors import LimitError, NotFoundError, UnavailableError
 from roel_service.jobs import scheduler as scheduling
 from roel_service.jobs.executors import InlineExecutor
+from roel_service.jobs.preparation import Prepared
 from roel_service.jobs.scheduler import Policy, Scheduler
-from roel_service.store.records import OperationMethod, OperationState, VersionState
+from roel_service.store.records import (
+    OperationMethod,
+    OperationState,
+    TaskRecord,
+    TaskState,
+    VersionState,
+)
 from roel_service.store.store import Store
 from roel_service.v1 import operations_pb2
 from roel_service.wire.errors import error_from_status
@@ -33,7 +40,7 @@ def begin(store, name, parameters=None):
 
 def prepare(operation, task):
     name, parameters = json.loads(task.parameters)
-    return f"sample_tasks:{name}", parameters
+    return Prepared(f"sample_tasks:{name}", parameters)
 
 
 @asynccontextmanager
@@ -288,3 +295,36 @@ def test_a_build_that_cannot_begin_leaves_its_place_free(store):
             return await ended(scheduler, store, operation)
 
     assert asyncio.run(scenario()).state is OperationState.SUCCEEDED
+
+
+def test_a_scheduler_survives_a_store_that_fails_for_a_while(store, monkeypatch, caplog):
+    lease, failures = store.tasks.lease, iter([OSError("disk full")])
+
+    def lease_or_fail(owner):
+        for error in failures:
+            raise error
+        return lease(owner)
+
+    monkeypatch.setattr(store.tasks, "lease", lease_or_fail)
+    assert ended_build(store, "build_nothing").state is OperationState.SUCCEEDED
+    assert "disk full" in caplog.text
+
+
+def test_time_to_wait_is_added_to_the_limit():
+    policy = Policy(unfinished_count=1, time_s=10.0)
+    task = TaskRecord(
+        id="t",
+        operation_id="o",
+        state=TaskState.LEASED,
+        parameters=b"",
+        inputs=[],
+        attempt_count=1,
+        memory_doublings=1,
+        failure_hash="",
+        not_before_us=0,
+        lease_owner="me",
+        lease_until_us=0,
+        fence=1,
+    )
+    limits = policy.limits(task, waits_s=5.0)
+    assert (limits.time_s, limits.memory_bytes) == (15.0, policy.max_memory_bytes)

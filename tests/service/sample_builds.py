@@ -27,6 +27,10 @@ def build(parameters, progress):
 
 def quick(parameters, progress):
     """Reads all inputs, answers with a map of three lines."""
+    if hasattr(parameters, "stream_id"):
+        from roel_service.jobs.following import follow
+
+        _, parameters = follow(parameters, progress)
     events, trajectory, _ = parameters.open()
     for index, stage in enumerate(MAPPING_STAGES):
         progress(Progress(stage=stage, done_count=1, total_count=1, fraction=index / 7))

@@ -18,7 +18,7 @@ from roel_service.wire.configs import config_to_proto
 from roel_service.wire.results import report_from_proto
 from roel_service.wire.rlm import decode_map
 
-from .processes import CAMERA, config_of, events_of, new_id, ready_recording
+from .processes import CAMERA, config_of, events_of, new_id, ready_recording, trajectory_of
 from .sample_builds import NO_ANSWER, QUICK, SEGMENTS, SLOW
 
 ACTIVE = maps_pb2.MapVersion.STATE_ACTIVE
@@ -145,6 +145,18 @@ def test_only_a_frozen_recording_with_poses_can_be_mapped(client, map_name):
         client.build_map(map_name, "projects/default/eventStreams/nowhere", config)
     assert not_finalized.value.reason == "STREAM_NOT_FINALIZED"
     assert no_poses.value.reason == "NO_POSES"
+
+
+def test_a_build_may_follow_a_recording_that_is_still_open(client, map_name):
+    stream = client.create_event_stream(new_id(), CAMERA)
+    operation = client.build_map(map_name, stream, config_of(QUICK), follow=True)
+    client.upload_poses(stream, trajectory_of(5))
+    client.upload_events(stream, events_of(10))
+    with pytest.raises(StateError) as in_use:
+        client.delete_event_stream(stream)
+    client.finalize(stream)
+    assert operation.wait().report.event_count == 10
+    assert in_use.value.reason == "STREAM_IN_USE"
 
 
 def test_a_map_whose_bytes_were_changed_is_not_sent(server, client, stream):
