@@ -388,18 +388,35 @@ class RegisterConfig(Stage, table="register"):
     Attributes:
         voxel_m: clouds are thinned to one point in each cube of this size.
         max_distance_m: a sample of the map with a point of the cloud this close counts as fitting.
+        reach_m, reach_deg: how far off a first guess may be.
+        gravity_aligned: whether z is vertical on both sides; `global` then looks for a heading only.
+        estimate_scale: whether the map's unit is unknown, as that of poses from one camera is.
+        last_scale_m: error beyond which a sample hardly counts in the end.
+        step_count: at most so many steps of the last level.
+        candidate_count: guesses that are followed up, the best first.
+        min_fitness: a smaller share of fitting samples is no registration.
+        min_agreement: nor is one whose lines agree less with surfaces and creases.
+        ambiguity_ratio: another transform that agrees at least so well against the best is a rival.
         sample_spacing_m: spacing of the points along lines of method `point`.
         point_gate_m: pairs of method `point` farther apart than this do not count.
         point_iteration_count: at most so many iterations of method `point`.
-        min_fitness: a smaller share of fitting samples is no registration.
     """
 
     voxel_m: float = parameter(0.02, POSITIVE)
     max_distance_m: float = parameter(0.05, POSITIVE)
+    reach_m: float = parameter(0.5, POSITIVE)
+    reach_deg: float = parameter(40.0, at_most(180))
+    gravity_aligned: bool = True
+    estimate_scale: bool = False
+    last_scale_m: float = parameter(0.01, POSITIVE)
+    step_count: int = parameter(20, UP_TO_1000)
+    candidate_count: int = parameter(8, at_most(1000))
+    min_fitness: float = parameter(0.6, SHARE)
+    min_agreement: float = parameter(0.35, SHARE)
+    ambiguity_ratio: float = parameter(0.85, SHARE)
     sample_spacing_m: float = parameter(0.005, POSITIVE)
     point_gate_m: float = parameter(0.5, POSITIVE)
     point_iteration_count: int = parameter(100, UP_TO_1000)
-    min_fitness: float = parameter(0.5, SHARE)
 
 
 @dataclass(frozen=True, kw_only=True)

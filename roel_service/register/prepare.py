@@ -9,7 +9,19 @@ from scipy.spatial import cKDTree
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
+from roel_service.register.directions import dominant_directions
+from roel_service.register.surfaces import Creases, find_creases, fit_patches, normals_of
+from roel_service.register.voting import VotingGrid, voting_grid
 from roel_service.scene.clouds import PointCloud
+
+# Cells of local planes and of the voting grid, in distances between points.
+PATCH_CELLS, VOTING_CELLS = 2.0, 7.5
+# The grid has room for a source this large, against the cloud's diagonal.
+ROOM_FOR_SOURCE = 1.0
+# A point this far from a plane, in distances between points, is none of it.
+PLANE_TOLERANCE = 0.6
+# Points whose neighbours tell how dense a cloud is.
+DENSITY_SAMPLE_COUNT, NEIGHBOUR_COUNT = 2000, 8
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -19,16 +31,62 @@ class PreparedCloud:
     Attributes:
         points: (N, 3) m, one for each occupied voxel.
         tree: of the points.
+        resolution_m: typical distance of neighbouring points, at least the voxel.
+        surface_points, surface_normals: (S, 3) those of the points that lie on local planes.
+        surface_tree: of the surface points.
+        creases: where local planes meet.
+        crease_tree: of the creases; None without any.
+        axes: (K, 3) directions that many creases share.
+        voting: grid on which shifts are scored.
     """
 
     points: FloatArray
     tree: cKDTree
+    resolution_m: float
+    surface_points: FloatArray
+    surface_normals: FloatArray
+    surface_tree: cKDTree
+    creases: Creases
+    crease_tree: cKDTree | None
+    axes: FloatArray
+    voting: VotingGrid
 
 
 def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
-    """Thin a cloud, and make the search tree."""
+    """Thin a cloud, and find its local planes and creases.
+
+    The planes are fitted to cells as large as the distance of the points asks for, so that a sparse
+    scan has some too.
+    """
     points = thin(cloud.points.astype(np.float64), config.voxel_m)
-    return PreparedCloud(points=points, tree=cKDTree(points))
+    tree = cKDTree(points)
+    resolution_m = max(config.voxel_m, _spacing(points, tree))
+    cell_m = PATCH_CELLS * resolution_m
+    patches = fit_patches(points, cell_m)
+    patch_tree = cKDTree(patches.centres)
+    normals, is_flat = normals_of(
+        points, patches, patch_tree, cell_m, PLANE_TOLERANCE * resolution_m
+    )
+    creases = find_creases(patches, patch_tree, tree, cell_m)
+    axes = dominant_directions(creases.directions, np.ones(len(creases.points)))
+    return PreparedCloud(
+        points=points,
+        tree=tree,
+        resolution_m=resolution_m,
+        surface_points=points[is_flat],
+        surface_normals=normals[is_flat],
+        surface_tree=cKDTree(points[is_flat]),
+        creases=creases,
+        crease_tree=cKDTree(creases.points) if len(creases.points) else None,
+        axes=axes,
+        voting=voting_grid(
+            points,
+            creases,
+            axes,
+            ROOM_FOR_SOURCE * float(np.linalg.norm(np.ptp(points, axis=0))),
+            VOTING_CELLS * resolution_m,
+        ),
+    )
 
 
 def thin(points: FloatArray, voxel_m: float) -> FloatArray:
@@ -40,3 +98,12 @@ def thin(points: FloatArray, voxel_m: float) -> FloatArray:
     starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
     sums = np.add.reduceat(points[order], starts)
     return np.asarray(sums / np.diff(starts, append=len(points))[:, None])
+
+
+def _spacing(points: FloatArray, tree: cKDTree) -> float:
+    """Side of the square that each point has to itself on a surface, median, m."""
+    if len(points) <= NEIGHBOUR_COUNT:
+        return 0.0
+    some = points[:: max(1, len(points) // DENSITY_SAMPLE_COUNT)]
+    distance_m, _ = tree.query(some, k=[NEIGHBOUR_COUNT + 1])
+    return float(np.median(distance_m)) * np.sqrt(np.pi / NEIGHBOUR_COUNT)

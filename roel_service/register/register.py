@@ -2,29 +2,46 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import CloudError
 from roel_service.geometry.se3 import SE3
+from roel_service.geometry.segments import sample_segments
+from roel_service.register.align import Level, align
+from roel_service.register.alignment import Alignment
+from roel_service.register.guesses import Guess, guesses_anywhere, guesses_near
 from roel_service.register.point_to_point import align_points
 from roel_service.register.prepare import PreparedCloud, prepare_cloud
-from roel_service.register.source import Samples, sample_map
-from roel_service.register.verdict import judge
+from roel_service.register.source import Source, source_of_cloud, source_of_map
+from roel_service.register.verdict import Rival, agreement, judge
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.lines import LineMap
-from roel_service.scene.results import RegistrationResult
+from roel_service.scene.results import RegistrationResult, StopReason
 
 METHODS = ("auto", "point", "plane", "line", "global")
 
 # Two maps of one place differ in size, but not like this.
 MAX_SIZE_RATIO = 100.0
 
+# Guesses are followed up with few samples and short steps: a voting cell has to be overcome.
+FOLLOW_UP_SCALES = 6.0, 1.5  # in distances between points
+FOLLOW_UP_SAMPLE_COUNT, FOLLOW_UP_STEP_COUNT, FOLLOW_UP_JUDGED_COUNT = 400, 10, 800
+# The last levels start where the follow-up ended.
+SETTLING_SAMPLE_COUNT, LAST_SAMPLE_COUNT = 1500, 6000
+LAST_FIRST_SCALE = 1.25
+
+# Methods that follow a first guess by one kind of pull: weights of surfaces and of creases.
+PULLS = {"plane": (1.0, 0.0), "line": (0.0, 1.0)}
+START_SCALE_M, START_SCALE_DECAY, START_STEP_COUNT = 0.5, 0.9, 80
+
 
 def register_map(
-    line_map: LineMap,
-    cloud: PointCloud | PreparedCloud,
+    source: LineMap | PreparedCloud,
+    target: PointCloud | PreparedCloud,
     config: RegisterConfig,
     *,
     method: str = "auto",
@@ -33,34 +50,122 @@ def register_map(
     """Where a line map lies in a cloud.
 
     Args:
-        line_map: the source.
-        cloud: the target; prepare it once for many registrations.
+        source: the map; a prepared cloud is registered by its points and creases.
+        target: the cloud; prepare it once for many registrations.
         config: parameters.
         method: one of `METHODS`.
-        T_init: first T_target_source; the identity by default.
+        T_init: first T_target_source; the identity by default, and not looked at by `global`.
 
     Raises:
         NoAnswerError: fewer than three lines.
         CloudError: a cloud in another unit than the map.
     """
-    samples = sample_map(line_map, config.sample_spacing_m)
-    if isinstance(cloud, PointCloud):
-        require_same_unit(samples, cloud.points)
-    target = cloud if isinstance(cloud, PreparedCloud) else prepare_cloud(cloud, config)
-    require_same_unit(samples, target.points)
-    alignment = align_points(
-        samples.points,
-        target.points,
-        T_init or SE3.identity(),
-        config.point_gate_m,
-        config.point_iteration_count,
+    moving = source_of_map(source) if isinstance(source, LineMap) else source_of_cloud(source)
+    if isinstance(target, PointCloud):
+        if not config.estimate_scale:
+            require_same_unit(moving, target.points)
+        target = prepare_cloud(target, config)
+    elif not config.estimate_scale:
+        require_same_unit(moving, target.points)
+    T_init = T_init or SE3.identity()
+    if method == "point":
+        return judge(_by_points(source, moving, target, T_init, config), [], moving, target, config)
+    if method in PULLS:
+        return judge(
+            _from_start(method, moving, target, T_init, config), [], moving, target, config
+        )
+    if method == "global":
+        guesses = guesses_anywhere(moving, target, config)
+    else:
+        guesses = guesses_near(moving, target, T_init, config)
+    return _best(guesses, moving, target, config)
+
+
+def _best(
+    guesses: list[Guess], source: Source, target: PreparedCloud, config: RegisterConfig
+) -> RegistrationResult:
+    """Follow up all guesses a little, and the best one to its end."""
+    first_scale, last_scale = (scale * target.resolution_m for scale in FOLLOW_UP_SCALES)
+    follow_up = Level(
+        first_scale_m=first_scale,
+        last_scale_m=last_scale,
+        sample_count=FOLLOW_UP_SAMPLE_COUNT,
+        step_count=FOLLOW_UP_STEP_COUNT,
+        estimate_scale=config.estimate_scale,
     )
-    return judge(alignment, samples, target, config)
+    rivals = []
+    for guess in guesses:
+        ended = align(source.samples, target, _start(guess), follow_up)
+        score = agreement(ended, source, target, FOLLOW_UP_JUDGED_COUNT).score
+        rivals.append(Rival(alignment=ended, score=score))
+    best = max(rivals, key=lambda rival: rival.score)
+    alignment = best.alignment
+    for level in _last_levels(config, LAST_FIRST_SCALE * target.resolution_m):
+        alignment = align(source.samples, target, alignment, level)
+    return judge(alignment, rivals, source, target, config)
 
 
-def require_same_unit(samples: Samples, points: FloatArray) -> None:
+def _from_start(
+    method: str, source: Source, target: PreparedCloud, T_init: SE3, config: RegisterConfig
+) -> Alignment:
+    """Surfaces alone, or creases alone, from the first guess."""
+    surface_weight, crease_weight = PULLS[method]
+    level = Level(
+        first_scale_m=START_SCALE_M,
+        last_scale_m=config.last_scale_m,
+        sample_count=SETTLING_SAMPLE_COUNT,
+        step_count=START_STEP_COUNT,
+        scale_decay=START_SCALE_DECAY,
+        estimate_scale=config.estimate_scale,
+        surface_weight=surface_weight,
+        crease_weight=crease_weight,
+    )
+    start = Guess(T_target_source=T_init, scale=1.0, votes=0.0)
+    return align(source.samples, target, _start(start), level)
+
+
+def _last_levels(config: RegisterConfig, first_scale_m: float) -> tuple[Level, Level]:
+    """Down to the last scale with some of the samples, then with all of them."""
+    settling = Level(
+        first_scale_m=first_scale_m,
+        last_scale_m=config.last_scale_m,
+        sample_count=SETTLING_SAMPLE_COUNT,
+        step_count=config.step_count,
+        estimate_scale=config.estimate_scale,
+    )
+    all_samples = replace(
+        settling, first_scale_m=config.last_scale_m, sample_count=LAST_SAMPLE_COUNT
+    )
+    return settling, all_samples
+
+
+def _start(guess: Guess) -> Alignment:
+    return Alignment(
+        T_target_source=guess.T_target_source,
+        scale=guess.scale,
+        stop_reason=StopReason.ITERATION_LIMIT,
+        iteration_count=0,
+    )
+
+
+def _by_points(
+    source: LineMap | PreparedCloud,
+    moving: Source,
+    target: PreparedCloud,
+    T_init: SE3,
+    config: RegisterConfig,
+) -> Alignment:
+    points = moving.samples.points
+    if isinstance(source, LineMap):
+        points, _ = sample_segments(source.segments, config.sample_spacing_m)
+    return align_points(
+        points, target.points, T_init, config.point_gate_m, config.point_iteration_count
+    )
+
+
+def require_same_unit(source: Source, points: FloatArray) -> None:
     """Refuse a cloud that is so much larger or smaller that its unit must be another one."""
-    source_m, target_m = (float(np.ptp(p, axis=0).max()) for p in (samples.points, points))
+    source_m, target_m = (float(np.ptp(p, axis=0).max()) for p in (source.samples.points, points))
     ratio = target_m / max(source_m, 1e-9)
     if 1.0 / MAX_SIZE_RATIO < ratio < MAX_SIZE_RATIO:
         return

@@ -6,90 +6,171 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import BoolArray, FloatArray
 from roel_service.config.stages import RegisterConfig
-from roel_service.geometry.se3 import skew
+from roel_service.geometry.se3 import SE3, rotation_angle, skew
+from roel_service.register.align import information
 from roel_service.register.alignment import Alignment
 from roel_service.register.prepare import PreparedCloud
-from roel_service.register.source import Samples
-from roel_service.scene.results import RegistrationResult, StopReason, Verdict
+from roel_service.register.source import Samples, Source
+from roel_service.scene.results import Alternative, RegistrationResult, StopReason, Verdict
 
 # A direction held this much less firmly than the firmest one is weak.
-WEAK_RATIO = 1e-3
+WEAK_RATIO = 2e-3
+# Samples this near to a surface or a crease, in distances between points, agree with it; lines and
+# creases have to run alike (cosine).
+SURFACE_REACH, CREASE_REACH, CREASE_COSINE = 1.5, 3.0, 0.96
+# Creases near a sample that are looked at.
+CREASE_COUNT = 3
+# Of all that agrees, creases count more than surfaces: every room is full of surfaces.
+CREASE_WEIGHT = 2.0
+# Samples that are looked at.
+JUDGED_COUNT = 3000
+# Transforms closer than this are one and the same.
+SAME_ROTATION_RAD, SAME_SHIFT_M = np.radians(3.0), 0.15
 
 
 @dataclass(frozen=True, kw_only=True)
-class Closeness:
-    """How near the source is to the target, and the other way round.
+class Agreement:
+    """Shares of the samples that lie on surfaces, and on creases that run their way."""
 
-    Attributes:
-        fitness: share of the source's samples with a target point near by.
-        overlap: share of the target's points around the source with a sample near by.
-        inlier_rmse_m: of the samples that count for `fitness`; None if none does.
-    """
+    surface: float
+    crease: float
 
-    fitness: float
-    overlap: float
-    inlier_rmse_m: float | None
+    @property
+    def score(self) -> float:
+        """Both in one, 0 to 1."""
+        return (self.surface + CREASE_WEIGHT * self.crease) / (1.0 + CREASE_WEIGHT)
 
 
-def closeness(moved: FloatArray, target: PreparedCloud, max_distance_m: float) -> Closeness:
-    """Compare the samples, moved into the target's frame, with the target."""
-    distance_m, _ = target.tree.query(moved, distance_upper_bound=max_distance_m, workers=-1)
-    near = distance_m <= max_distance_m
-    rmse_m = float(np.sqrt((distance_m[near] ** 2).mean())) if near.any() else None
-    return Closeness(fitness=float(near.mean()), overlap=0.0, inlier_rmse_m=rmse_m)
+def agreement(
+    alignment: Alignment, source: Source, target: PreparedCloud, count: int = JUDGED_COUNT
+) -> Agreement:
+    """How well the source, moved, agrees with the target."""
+    samples, votes = source.samples.at_most(count), source.votes.at_most(count)
+    reach_m = SURFACE_REACH * target.resolution_m
+    distance_m, _ = target.tree.query(_moved(alignment, samples), distance_upper_bound=reach_m)
+    on_crease = _on_crease(alignment, votes, target) if len(votes) else np.zeros(1, np.bool_)
+    return Agreement(surface=float(np.isfinite(distance_m).mean()), crease=float(on_crease.mean()))
 
 
-def information_of_points(moved: FloatArray, sigma_m: FloatArray) -> FloatArray:
-    """(6, 6) of points whose three coordinates are known to `sigma_m`; tangent (r, d)."""
-    # p moves by r x p + d.
-    J = np.concatenate([-skew(moved), np.broadcast_to(np.eye(3), (len(moved), 3, 3))], axis=-1)
-    J = J / sigma_m[:, None, None]
-    return np.asarray(np.einsum("pij,pik->jk", J, J))
+def _on_crease(alignment: Alignment, votes: Samples, target: PreparedCloud) -> BoolArray:
+    """(P,) whether a crease that runs along is near."""
+    if target.crease_tree is None:
+        return np.zeros(len(votes), np.bool_)
+    reach_m = CREASE_REACH * target.resolution_m
+    distance_m, near = target.crease_tree.query(
+        _moved(alignment, votes), k=CREASE_COUNT, distance_upper_bound=reach_m
+    )
+    known = np.isfinite(distance_m)
+    creases = target.creases.directions[np.where(known, near, 0)]
+    lines = alignment.T_target_source.rotate(votes.directions)
+    alike = np.abs(np.einsum("pkc,pc->pk", creases, lines)) > CREASE_COSINE
+    return np.asarray((known & alike).any(axis=1))
 
 
-def weak_directions(information: FloatArray, centre: FloatArray, radius_m: float) -> FloatArray:
-    """(K, 6) unit tangents about the source's centre that the information hardly holds.
+def _moved(alignment: Alignment, samples: Samples) -> FloatArray:
+    return alignment.T_target_source @ (alignment.scale * samples.points)
 
-    Args:
-        information: (6, 6) of (r, d), target frame.
-        centre: (3,) of the moved source; turning about it leaves the translation alone.
-        radius_m: what one radian moves a typical sample by, to compare turns with shifts.
-    """
-    # d = d_centre - r x centre = d_centre + centre x r
-    from_scaled = np.eye(6)
-    from_scaled[3:, :3] = skew(centre)
-    from_scaled[:, :3] /= radius_m
-    values, vectors = np.linalg.eigh(from_scaled.T @ information @ from_scaled)
-    return np.asarray(vectors[:, values < WEAK_RATIO * values[-1]].T)
+
+def is_same(a: SE3, b: SE3, centre: FloatArray) -> bool:
+    """Whether two transforms put the source's middle at one place, turned alike."""
+    turn_rad = float(rotation_angle(a.rotation @ b.rotation.T))
+    shift_m = float(np.linalg.norm(a @ centre - b @ centre))
+    return turn_rad < SAME_ROTATION_RAD and shift_m < SAME_SHIFT_M
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Rival:
+    """Where another guess ended, and its agreement's score."""
+
+    alignment: Alignment
+    score: float
 
 
 def judge(
-    alignment: Alignment, samples: Samples, target: PreparedCloud, config: RegisterConfig
+    alignment: Alignment,
+    rivals: list[Rival],
+    source: Source,
+    target: PreparedCloud,
+    config: RegisterConfig,
 ) -> RegistrationResult:
-    """The result of a method, with what it is worth."""
-    T = alignment.T_target_source
-    moved = T @ (alignment.scale * samples.points)
-    close = closeness(moved, target, config.max_distance_m)
-    information, weak = None, np.empty((0, 6))
-    if close.inlier_rmse_m is not None:
-        sigma_m = np.full(len(moved), max(close.inlier_rmse_m, 1e-3))
-        information = information_of_points(moved, sigma_m)
-        weak = weak_directions(information, moved.mean(axis=0), samples.radius_m)
-    rejected = close.fitness < config.min_fitness
-    verdict = Verdict.REJECTED if rejected else Verdict.ACCEPTED
-    if len(weak) and not rejected:
-        verdict = Verdict.AMBIGUOUS
+    """The result of a method, with what it is worth.
+
+    Args:
+        alignment: the transform.
+        rivals: where other guesses ended, in any order.
+    """
+    samples = source.samples
+    moved = _moved(alignment, samples)
+    distance_m, _ = target.tree.query(moved, distance_upper_bound=config.max_distance_m, workers=-1)
+    near = np.isfinite(distance_m)
+    found = agreement(alignment, source, target)
+    alternatives = _alternatives(alignment, rivals, found.score, source, config)
+    held, weak = None, np.empty((0, 6))
+    if near.any():
+        held = information(alignment, samples, target)
+        arm = moved.mean(axis=0) - alignment.T_target_source.translation
+        weak = weak_directions(held, arm, _radius_m(moved))
+    fitness = float(near.mean())
     return RegistrationResult(
-        T_target_source=T,
+        T_target_source=alignment.T_target_source,
         scale=alignment.scale,
-        stop_reason=StopReason.NO_OVERLAP if close.fitness == 0.0 else alignment.stop_reason,
-        verdict=verdict,
-        fitness=close.fitness,
-        overlap=close.overlap,
-        inlier_rmse_m=close.inlier_rmse_m,
-        information=information,
+        stop_reason=alignment.stop_reason if near.any() else StopReason.NO_OVERLAP,
+        verdict=_verdict(fitness, found, bool(alternatives) or len(weak) > 0, config),
+        fitness=fitness,
+        agreement=found.score,
+        inlier_rmse_m=float(np.sqrt((distance_m[near] ** 2).mean())) if near.any() else None,
+        information=held,
         weak_directions=weak,
+        alternatives=tuple(alternatives),
         iteration_count=alignment.iteration_count,
     )
+
+
+def _verdict(
+    fitness: float, found: Agreement, is_contested: bool, config: RegisterConfig
+) -> Verdict:
+    if fitness < config.min_fitness or found.score < config.min_agreement:
+        return Verdict.REJECTED
+    return Verdict.AMBIGUOUS if is_contested else Verdict.ACCEPTED
+
+
+def _alternatives(
+    alignment: Alignment,
+    rivals: list[Rival],
+    score: float,
+    source: Source,
+    config: RegisterConfig,
+) -> list[Alternative]:
+    """Other transforms that agree about as well, best first, each once."""
+    kept = [alignment.T_target_source]
+    found = []
+    for rival in sorted(rivals, key=lambda rival: -rival.score):
+        T = rival.alignment.T_target_source
+        if rival.score < config.ambiguity_ratio * score:
+            break
+        if not any(is_same(T, other, source.centre) for other in kept):
+            kept.append(T)
+            found.append(Alternative(T_target_source=T, score=rival.score))
+    return found
+
+
+def _radius_m(points: FloatArray) -> float:
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def weak_directions(held: FloatArray, arm: FloatArray, radius_m: float) -> FloatArray:
+    """(K, 6) unit tangents about the source's centre that the information hardly holds.
+
+    Args:
+        held: (6, 6) information of (r, d), target frame.
+        arm: (3,) the centre of the moved source, seen from the translation.
+        radius_m: what one radian moves a typical sample by, to compare turns with shifts.
+    """
+    # The centre moves by r x arm + d.
+    from_scaled = np.eye(6)
+    from_scaled[3:, :3] = skew(arm)
+    from_scaled[:, :3] /= max(radius_m, 1e-9)
+    values, vectors = np.linalg.eigh(from_scaled.T @ held @ from_scaled)
+    return np.asarray(vectors[:, values < WEAK_RATIO * values[-1]].T)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -33,6 +35,160 @@ def test_point_icp_comes_close_from_a_close_start(prepared):
     assert millimetres < 30.0
     assert result.converged
     assert result.verdict is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("method", ["plane", "line"])
+def test_single_pulls_come_close_from_a_close_start(prepared, method):
+    result = register_map(room_map(), prepared, CONFIG, method=method, T_init=NUDGE)
+    degrees, millimetres = errors(result.T_target_source)
+    assert degrees < 0.2
+    assert millimetres < 5.0
+    assert result.verdict is Verdict.ACCEPTED
+
+
+def turned_start(seed):
+    """30 degrees about a random axis, 0.3 m in a random direction."""
+    axis, shift = np.random.default_rng(seed).normal(size=(2, 3))
+    return SE3(
+        rotation=rotation_from_vector(np.radians(30) * axis / np.linalg.norm(axis)),
+        translation=0.3 * shift / np.linalg.norm(shift),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_default_comes_home_from_30_degrees_and_30_centimetres(prepared, seed):
+    result = register_map(room_map(), prepared, CONFIG, T_init=turned_start(seed))
+    degrees, millimetres = errors(result.T_target_source)
+    assert degrees < 0.1
+    assert millimetres < 5.0
+    assert result.verdict is Verdict.ACCEPTED
+    assert result.converged
+    assert len(result.weak_directions) == 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_global_finds_any_heading_and_place(prepared, seed):
+    rng = np.random.default_rng(seed)
+    T = SE3(
+        rotation=rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)])),
+        translation=rng.uniform(-5.0, 5.0, 3),
+    )
+    result = register_map(room_map().transformed(T), prepared, CONFIG, method="global")
+    degrees, millimetres = errors(result.T_target_source @ T)
+    assert degrees < 0.1
+    assert millimetres < 5.0
+    assert result.verdict is Verdict.ACCEPTED
+
+
+def test_global_finds_any_rotation_if_gravity_is_unknown(prepared):
+    T = SE3(rotation=rotation_from_vector(np.array([1.0, -2.0, 0.5])), translation=[1.0, 2.0, 3.0])
+    free = dataclasses.replace(CONFIG, gravity_aligned=False)
+    result = register_map(room_map().transformed(T), prepared, free, method="global")
+    degrees, millimetres = errors(result.T_target_source @ T)
+    assert degrees < 0.1
+    assert millimetres < 5.0
+
+
+def test_a_map_of_unknown_unit_is_scaled(prepared):
+    scaled = LineMap.from_segments(0.37 * room_map().segments)
+    config = dataclasses.replace(CONFIG, estimate_scale=True)
+    result = register_map(scaled, prepared, config, method="global")
+    assert result.scale == pytest.approx(1 / 0.37, rel=2e-3)
+    assert max(errors(result.T_target_source)) < 10.0
+
+
+def test_a_symmetric_room_has_two_answers_and_says_so():
+    boxes = (((0.0, 0.0, 0.0), (4.0, 3.0, 2.5)),)
+    cloud = prepare_cloud(room_cloud(boxes), CONFIG)
+    result = register_map(room_map(boxes), cloud, CONFIG, method="global")
+    assert result.verdict is Verdict.AMBIGUOUS
+    (other,) = result.alternatives
+    half_turn = other.T_target_source @ result.T_target_source.inverse()
+    assert np.degrees(rotation_angle(half_turn.rotation)) == pytest.approx(180.0, abs=1.0)
+
+
+def test_a_map_of_another_room_is_rejected(prepared):
+    other = (((0.0, 0.0, 0.0), (6.0, 2.1, 3.0)), ((2.0, 0.4, 0.0), (2.6, 1.4, 1.9)))
+    result = register_map(room_map(other), prepared, CONFIG, method="global")
+    assert result.verdict is Verdict.REJECTED
+
+
+def test_one_plane_leaves_three_directions_open():
+    rng = np.random.default_rng(0)
+    floor = np.c_[rng.uniform(0.0, 4.0, (20_000, 2)), rng.normal(0.0, 0.003, 20_000)]
+    lines = rng.uniform(0.5, 3.5, (30, 2, 3)) * [1.0, 1.0, 0.0]
+    result = register_map(LineMap.from_segments(lines), PointCloud(points=floor), CONFIG)
+    assert result.verdict is not Verdict.ACCEPTED
+    # Shifts along the floor, and turns about its normal.
+    assert len(result.weak_directions) == 3
+    np.testing.assert_allclose(result.weak_directions[:, [0, 1, 5]], 0.0, atol=0.05)
+
+
+@pytest.fixture(scope="module")
+def found(prepared):
+    return register_map(room_map(), prepared, CONFIG, T_init=NUDGE).T_target_source
+
+
+class TestProperties:
+    """What must hold whatever the numbers are."""
+
+    MOTION = SE3(
+        rotation=rotation_from_vector(np.array([0.2, -0.1, 0.4])), translation=[0.3, -1.0, 0.5]
+    )
+    # Nearest neighbours of moved points differ a little: voxels and cells lie elsewhere.
+    BOUND = 0.05, 2.0
+
+    def assert_same(self, found, expected):
+        degrees, millimetres = errors(found, expected)
+        assert degrees < self.BOUND[0]
+        assert millimetres < self.BOUND[1]
+
+    def test_a_motion_of_the_map_moves_the_answer(self, prepared, found):
+        moved = room_map().transformed(self.MOTION)
+        T_init = NUDGE @ self.MOTION.inverse()
+        result = register_map(moved, prepared, CONFIG, T_init=T_init)
+        self.assert_same(result.T_target_source @ self.MOTION, found)
+
+    def test_a_motion_of_the_cloud_moves_the_answer(self, found):
+        cloud = PointCloud(points=self.MOTION @ room_cloud().points.astype(np.float64))
+        result = register_map(room_map(), cloud, CONFIG, T_init=self.MOTION @ NUDGE)
+        self.assert_same(self.MOTION.inverse() @ result.T_target_source, found)
+
+    def test_the_order_of_lines_changes_nothing(self, prepared, found):
+        order = np.random.default_rng(3).permutation(len(room_map()))
+        shuffled = LineMap(
+            **{
+                field.name: getattr(room_map(), field.name)[order]
+                for field in dataclasses.fields(LineMap)
+            }
+        )
+        result = register_map(shuffled, prepared, CONFIG, T_init=NUDGE)
+        np.testing.assert_allclose(result.T_target_source.matrix(), found.matrix(), atol=1e-9)
+
+    def test_the_order_of_points_changes_nothing(self, prepared, found):
+        cloud = room_cloud()
+        order = np.random.default_rng(4).permutation(len(cloud))
+        shuffled = PointCloud(points=cloud.points[order])
+        result = register_map(room_map(), shuffled, CONFIG, T_init=NUDGE)
+        np.testing.assert_allclose(result.T_target_source.matrix(), found.matrix(), atol=1e-6)
+
+    def test_lines_beyond_the_gate_change_little(self, prepared, found):
+        far = room_map().segments[:6] + np.array([0.0, 0.0, 9.0])
+        segments = np.concatenate([room_map().segments, far])
+        outliers = dataclasses.replace(
+            LineMap.from_segments(segments), sigma_m=np.full(len(segments), 0.01)
+        )
+        result = register_map(outliers, prepared, CONFIG, T_init=NUDGE)
+        self.assert_same(result.T_target_source, found)
+
+    def test_clouds_onto_one_another_forwards_and_backwards_are_inverse(self, prepared):
+        other = room_cloud(seed=7)
+        moved = PointCloud(points=self.MOTION @ other.points.astype(np.float64))
+        there = prepare_cloud(moved, CONFIG)
+        forward = register_map(prepared, there, CONFIG, T_init=self.MOTION @ NUDGE)
+        backward = register_map(there, prepared, CONFIG, T_init=(self.MOTION @ NUDGE).inverse())
+        self.assert_same(forward.T_target_source @ backward.T_target_source, SE3.identity())
+        self.assert_same(forward.T_target_source, self.MOTION)
 
 
 def test_a_map_without_lines_has_no_answer(prepared):

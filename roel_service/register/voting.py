@@ -1,0 +1,239 @@
+"""Where a turned map may lie: all shifts are scored at once, by correlation on a grid.
+
+Lines vote for creases of the cloud that run their way, and less so for surfaces. The best shifts are
+then looked at again on a finer grid, which the correlation would take too long on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft, ndimage
+
+from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
+from roel_service.register.surfaces import Creases
+
+# Lines and creases this near to a direction (cosine) vote in its channel.
+CHANNEL_COSINE = 0.93
+# What a surface near a sample counts against a crease.
+SURFACE_WEIGHT = 0.3
+# The grid is made coarser until both clouds fit into so many cells.
+MAX_CELL_COUNT = 1 << 20
+# The fine grid's cells in one of the coarse grid's, and how many of its cells a shift may move.
+FINE_CELLS, FINE_REACH = 3, 3
+MAX_FINE_CELL_COUNT = 1 << 22
+# Samples that are looked at on the fine grid.
+FINE_SAMPLE_COUNT = 300
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VotingGrid:
+    """The target's side of the correlation, transformed once.
+
+    Attributes:
+        axes: (K, 3) directions of the channels.
+        origin: (3,) m, corner of the grid.
+        cell_m: size of a cell.
+        shape: cells of the grid along each axis, the source's share included.
+        spectra: of each direction's channel, and of the surfaces last.
+        source_size_m: largest extent that a source may have in any direction.
+        fine: (K + 1, *F) presence in each channel on the fine grid, zero on its border.
+        fine_cell_m: size of its cells.
+    """
+
+    axes: FloatArray
+    origin: FloatArray
+    cell_m: float
+    shape: tuple[int, ...]
+    spectra: list[Array]
+    source_size_m: float
+    fine: Array
+    fine_cell_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Votes:
+    """Scores of shifts: `scores[i]` is of a shift by `shifts[i]`, best first.
+
+    Attributes:
+        shifts: (V, 3) m.
+        scores: (V,) votes a sample.
+    """
+
+    shifts: FloatArray
+    scores: FloatArray
+
+
+def voting_grid(
+    surfaces: FloatArray,
+    creases: Creases,
+    axes: FloatArray,
+    source_size_m: float,
+    cell_m: float,
+) -> VotingGrid:
+    """Prepare a target for votes.
+
+    Args:
+        surfaces: (N, 3) m.
+        creases: of the target.
+        axes: (K, 3) directions of the channels.
+        source_size_m: largest extent that the source can have in any direction.
+        cell_m: wanted size of a cell.
+    """
+    origin = surfaces.min(axis=0)
+    extent_m = np.ptp(surfaces, axis=0)
+    size_m = extent_m + source_size_m
+    cell_m = max(cell_m, float(np.cbrt(size_m.prod() / MAX_CELL_COUNT)))
+    shape = tuple(fft.next_fast_len(int(n), real=True) for n in np.ceil(size_m / cell_m) + 4)
+    fine_cell_m = max(
+        cell_m / FINE_CELLS, float(np.cbrt((extent_m + cell_m).prod() / MAX_FINE_CELL_COUNT))
+    )
+    fine_shape = tuple(int(n) for n in np.ceil(extent_m / fine_cell_m) + 3)
+    channel = channels_of(creases.directions, axes)
+    members = [creases.points[channel == k] for k in range(len(axes))] + [surfaces]
+    weights = [1.0] * len(axes) + [SURFACE_WEIGHT]
+    spectra, fine = [], []
+    for points, weight in zip(members, weights, strict=True):
+        spectra.append(_spectrum(weight * _presence(points, origin, cell_m, shape)))
+        corner = origin - fine_cell_m
+        fine.append(weight * _presence(points, corner, fine_cell_m, fine_shape))
+    return VotingGrid(
+        axes=axes,
+        origin=origin,
+        cell_m=cell_m,
+        shape=shape,
+        spectra=spectra,
+        source_size_m=source_size_m,
+        fine=np.stack(fine),
+        fine_cell_m=fine_cell_m,
+    )
+
+
+def sharpened(
+    grid: VotingGrid, points: FloatArray, directions: FloatArray, shift: FloatArray
+) -> FloatArray:
+    """(3,) the shift near a coarse one that has the most votes on the fine grid.
+
+    Args:
+        grid: of the target.
+        points, directions: (P, 3) turned samples of the source.
+        shift: (3,) m.
+    """
+    stride = -(-len(points) // FINE_SAMPLE_COUNT)
+    points, directions = points[::stride], directions[::stride]
+    steps = np.arange(-FINE_REACH, FINE_REACH + 1)
+    offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    corner = grid.origin - grid.fine_cell_m
+    cells = np.rint((points + shift - corner) / grid.fine_cell_m).astype(np.int64)
+    # What falls outside meets the empty border.
+    limit = np.array(grid.fine.shape[1:]) - 1
+    places = np.clip(cells + offsets[:, None], 0, limit)
+    x, y, z = places[..., 0], places[..., 1], places[..., 2]
+    scores = grid.fine[-1, x, y, z].sum(axis=1)
+    channel = channels_of(directions, grid.axes)
+    known = channel >= 0
+    if known.any():
+        scores += grid.fine[channel[known], x[:, known], y[:, known], z[:, known]].sum(axis=1)
+    # Of equal ones the nearest to the coarse shift.
+    best = np.lexsort((np.abs(offsets).sum(axis=1), -scores))[0]
+    return np.asarray(shift + offsets[best] * grid.fine_cell_m)
+
+
+def channels_of(directions: FloatArray, axes: FloatArray) -> IntArray:
+    """(N,) the axis that each direction is near to; -1 for none."""
+    if len(axes) == 0:
+        return np.full(len(directions), -1)
+    cosines = np.abs(directions @ axes.T)
+    return np.where(cosines.max(axis=1) > CHANNEL_COSINE, cosines.argmax(axis=1), -1)
+
+
+def vote(
+    grid: VotingGrid,
+    points: FloatArray,
+    directions: FloatArray,
+    count: int,
+    allowed: FloatArray | None = None,
+    reach_m: float = 0.0,
+) -> Votes:
+    """The shifts that bring the most samples onto creases of their direction, or surfaces.
+
+    Args:
+        grid: of the target.
+        points, directions: (P, 3) turned samples of the source.
+        count: of shifts to answer, at most.
+        allowed: (A, 3) m; only shifts within `reach_m` of one of these, along each axis.
+    """
+    corner = points.min(axis=0)
+    # Wild lines that the grid does not hold vote somewhere in it; they are few.
+    cells = np.rint((points - corner) / grid.cell_m).astype(np.int64) % np.array(grid.shape)
+    channel = channels_of(directions, grid.axes)
+    total = np.zeros((*grid.shape[:2], grid.shape[2] // 2 + 1), np.complex64)
+    for k, spectrum in enumerate(grid.spectra):
+        chosen = cells if k == len(grid.axes) else cells[channel == k]
+        if len(chosen):
+            votes = np.zeros(grid.shape, np.float32)
+            np.add.at(votes, tuple(chosen.T), 1.0)
+            total += spectrum * np.conj(_spectrum(votes))
+    scores = fft.irfftn(total, grid.shape, workers=2) / len(points)
+    # Cells of the source start at `corner`: a shift by i cells puts it at origin + i cells.
+    offset = grid.origin - corner
+    if allowed is not None:
+        scores[~_within(grid, offset, allowed, reach_m)] = -np.inf
+    return _peaks(grid, scores, offset, count)
+
+
+def _within(grid: VotingGrid, offset: FloatArray, allowed: FloatArray, reach_m: float) -> BoolArray:
+    """Which shifts of the grid lie in a cube about one of the allowed ones."""
+    inside = np.zeros(grid.shape, np.bool_)
+    steps = [np.arange(n) for n in grid.shape]
+    for place in allowed:
+        axes = []
+        for k, step in enumerate(steps):
+            # Shifts to below the origin have wrapped around to the far end.
+            shift = np.where(step > grid.shape[k] // 2, step - grid.shape[k], step)
+            near_low = np.abs(offset[k] + step * grid.cell_m - place[k]) <= reach_m
+            near_wrapped = np.abs(offset[k] + shift * grid.cell_m - place[k]) <= reach_m
+            axes.append(near_low | near_wrapped)
+        inside |= axes[0][:, None, None] & axes[1][:, None] & axes[2]
+    return inside
+
+
+def _peaks(grid: VotingGrid, scores: Array, offset: FloatArray, count: int) -> Votes:
+    """The best shifts, none next to another."""
+    shape = np.array(grid.shape)
+    cells, values = [], []
+    for _ in range(count):
+        best = np.array(np.unravel_index(np.argmax(scores), grid.shape))
+        value = scores[tuple(best)]
+        if not np.isfinite(value):
+            break
+        cells.append(best)
+        values.append(float(value))
+        around = [(best[k] + np.arange(-2, 3)) % shape[k] for k in range(3)]
+        scores[np.ix_(*around)] = -np.inf
+    # A source that reaches out of the target on the low side has wrapped around.
+    found = np.array(cells).reshape(-1, 3)
+    found = np.where(found > WRAP_SHARE * shape, found - shape, found)
+    return Votes(shifts=offset + found * grid.cell_m, scores=np.array(values))
+
+
+# Shifts beyond this share of the grid are taken for wrapped, negative ones.
+WRAP_SHARE = 0.66
+
+
+def _presence(
+    points: FloatArray, origin: FloatArray, cell_m: float, shape: tuple[int, ...]
+) -> Array:
+    """Cells with points, blurred by a cell, at most one."""
+    grid = np.zeros(shape, np.float32)
+    cells = np.rint((points - origin) / cell_m).astype(np.int64)
+    grid[tuple(cells.T)] = 1.0
+    if len(points) == 0:
+        return grid
+    blurred = ndimage.gaussian_filter(grid, 0.7, mode="constant")
+    return np.asarray(blurred / max(float(blurred.max()), 1e-9))
+
+
+def _spectrum(grid: Array) -> Array:
+    return np.asarray(fft.rfftn(grid, workers=2))
