@@ -106,4 +106,4 @@ def _spacing(points: FloatArray, tree: cKDTree) -> float:
         return 0.0
     some = points[:: max(1, len(points) // DENSITY_SAMPLE_COUNT)]
     distance_m, _ = tree.query(some, k=[NEIGHBOUR_COUNT + 1])
-    return float(np.median(distance_m)) * np.sqrt(np.pi / NEIGHBOUR_COUNT)
+    return float(np.median(distance_m) * np.sqrt(np.pi / NEIGHBOUR_COUNT))
