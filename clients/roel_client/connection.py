@@ -32,7 +32,8 @@ CHANNEL_OPTIONS = (
     ("grpc.enable_retries", 0),
     ("grpc.max_send_message_length", 4 * MIB),
     ("grpc.max_receive_message_length", 8 * MIB),
-    # A server that comes back is found soon; by default the pauses grow to two minutes.
+    # A server that comes back is found soon; by default the pauses grow from one second to two minutes.
+    ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.max_reconnect_backoff_ms", 2_000),
     # A dead network is noticed within 30 s, also during an upload or a watch.
     ("grpc.keepalive_time_ms", 20_000),

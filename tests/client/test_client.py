@@ -19,7 +19,7 @@ from roel_service.scene.results import MAPPING_STAGES
 from roel_service.v1 import events_pb2, events_pb2_grpc, maps_pb2, maps_pb2_grpc
 from roel_service.wire.rlm import decode_map
 
-from ..service.processes import CAMERA, config_of, events_of, new_id, trajectory_of
+from ..service.processes import CAMERA, Server, config_of, events_of, new_id, trajectory_of
 from ..service.sample_builds import BUG, NO_ANSWER, QUICK, SLOW, SLOW_ONCE
 
 # Nothing listens on the discard port of loopback.
@@ -118,8 +118,9 @@ def test_poses_of_many_messages_arrive_whole(client):
     client.delete_event_stream(stream)
 
 
-def test_an_upload_continues_on_the_server_that_took_over(start_server):
-    """The server is killed while it receives; its successor gets only what it does not have."""
+@pytest.mark.parametrize("end", [Server.kill, Server.stop])
+def test_an_upload_continues_on_the_server_that_took_over(start_server, end):
+    """The server ends while it receives; its successor gets only what it does not have."""
     first = start_server(commit_bytes=1)
     successors = []
 
@@ -132,7 +133,7 @@ def test_an_upload_continues_on_the_server_that_took_over(start_server):
             events = events_of(400_000)
             yield events
             if not successors:
-                first.kill()
+                end(first)
                 successors.append(start_server(port=first.port))
 
     with Client(first.address) as client:
