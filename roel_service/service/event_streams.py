@@ -13,6 +13,7 @@ from roel_service.errors import InputError, LimitError, TrajectoryError
 from roel_service.service.append import EventSink
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
+from roel_service.service.requests import request_id
 from roel_service.service.settings import Settings
 from roel_service.service.uploads import OpenUploads, Upload, next_request, request_part
 from roel_service.store.event_streams import EventStreams, PosePart
@@ -47,7 +48,8 @@ class EventStreamServicer:
         names.check_parent(request.parent)
         stream_id = names.checked_id(request.event_stream_id, "event_stream_id")
         camera = camera_from_proto(request.event_stream.camera)
-        record = await asyncio.to_thread(self._streams.create, stream_id, camera)
+        create = self._streams.create
+        record = await asyncio.to_thread(create, stream_id, camera, request_id(request))
         return event_stream_to_proto(record)
 
     async def AppendEvents(
@@ -107,7 +109,9 @@ class EventStreamServicer:
         self, request: events_pb2.FinalizeEventStreamRequest, context: Any
     ) -> events_pb2.EventStream:
         stream_id = names.event_stream_id(request.name)
-        return event_stream_to_proto(await asyncio.to_thread(self._streams.finalize, stream_id))
+        finalize = self._streams.finalize
+        record = await asyncio.to_thread(finalize, stream_id, request.etag, request_id(request))
+        return event_stream_to_proto(record)
 
     async def GetEventStream(
         self, request: events_pb2.GetEventStreamRequest, context: Any
@@ -128,7 +132,9 @@ class EventStreamServicer:
     async def DeleteEventStream(
         self, request: events_pb2.DeleteEventStreamRequest, context: Any
     ) -> Empty:
-        await asyncio.to_thread(self._streams.delete, names.event_stream_id(request.name))
+        stream_id = names.event_stream_id(request.name)
+        delete = self._streams.delete
+        await asyncio.to_thread(delete, stream_id, request.etag, request_id(request))
         return Empty()
 
     async def _record(self, name: str) -> EventStreamRecord:

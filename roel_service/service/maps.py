@@ -148,9 +148,9 @@ class MapServicer:
     async def DeleteMapVersion(
         self, request: maps_pb2.DeleteMapVersionRequest, context: Any
     ) -> maps_pb2.MapVersion:
-        map_id, label = names.map_version_id(request.name)
+        map_id, number = names.map_version_number(request.name)
         delete = self._store.maps.delete_version
-        record = await asyncio.to_thread(delete, map_id, label, request_id(request))
+        record = await asyncio.to_thread(delete, map_id, number, request_id(request))
         return map_version_to_proto(record)
 
     async def PromoteMapVersion(

@@ -56,6 +56,7 @@ def event_stream_to_proto(record: EventStreamRecord) -> events_pb2.EventStream:
         end_us=record.end_us,
         pose_count=record.pose_count,
         digest=record.digest,
+        etag=record.etag,
         create_time=_timestamp(record.create_time_us),
     )
 

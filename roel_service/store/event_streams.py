@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from roel_service.scene.trajectory import MAX_POSE_GAP_US
 from roel_service.store.blobs import BlobStore
 from roel_service.store.chunk_reader import ChunkReader
 from roel_service.store.database import Database
+from roel_service.store.etags import check_etag
 from roel_service.store.locks import KeyedLocks
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import (
@@ -39,7 +41,10 @@ from roel_service.store.records import (
     row_from_record,
     stored,
 )
+from roel_service.store.requests import RequestId, once, recall, row_memory
 from roel_service.store.schema import EVENT_CHUNK, EVENT_STREAM, OPERATION, POSE_PART
+
+_MEMORY = row_memory(event_stream_from_row)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +91,9 @@ class EventStreams:
         # file durable, needs no transaction.
         self._locks = KeyedLocks()
 
-    def create(self, stream_id: str, camera: Camera) -> EventStreamRecord:
+    def create(
+        self, stream_id: str, camera: Camera, request: RequestId | None = None
+    ) -> EventStreamRecord:
         """Open a recording; raises `ConflictError` ALREADY_EXISTS."""
         record = EventStreamRecord(
             id=stream_id,
@@ -104,13 +111,17 @@ class EventStreams:
             longest_gap_us=0,
             create_time_us=now_us(),
         )
-        with self._database.write() as connection:
+
+        def act(connection: Connection) -> EventStreamRecord:
             if _row(connection, stream_id) is not None:
                 expected = "an id not in use"
                 raise ConflictError("event stream", expected, stream_id, reason="ALREADY_EXISTS")
             connection.execute(insert(EVENT_STREAM), row_from_record(record))
             self._recordings.create(record.uid)
-        return record
+            return record
+
+        with self._database.write() as connection:
+            return once(connection, request, _MEMORY, partial(act, connection))
 
     def get(self, stream_id: str) -> EventStreamRecord:
         """One recording; raises `NotFoundError`."""
@@ -200,33 +211,55 @@ class EventStreams:
             connection.execute(insert(POSE_PART), stored(row))
             return _update(connection, record, pose_count=pose_count)
 
-    def finalize(self, stream_id: str) -> EventStreamRecord:
-        """Freeze a recording and seal its events into a blob; raises `EventsError` NO_EVENTS."""
+    def finalize(
+        self, stream_id: str, etag: str = "", request: RequestId | None = None
+    ) -> EventStreamRecord:
+        """Freeze a recording and seal its events into a blob.
+
+        Raises:
+            EventsError: NO_EVENTS.
+            ConflictError: ETAG_MISMATCH.
+        """
         with self._locks.holding(stream_id):
-            record = self.get(stream_id)
-            if record.state is StreamState.FINALIZED:
+            with self._database.read() as connection:
+                known = recall(connection, request, _MEMORY)
+                record = known or _get(connection, stream_id)
+            if known is not None or record.state is StreamState.FINALIZED:
                 return record
+            check_etag(record.etag, etag)
             if record.event_count == 0:
                 raise EventsError(stream_id, "events", "none", reason="NO_EVENTS")
             digest = self._blobs.adopt(self._recordings.cut(record.uid, record.size_bytes))
             failpoint("recording.sealed")
-            with self._database.write() as connection:
+
+            def act(connection: Connection) -> EventStreamRecord:
                 current = _get(connection, stream_id)
-                sealed = _update(connection, current, state=StreamState.FINALIZED, digest=digest)
+                return _update(connection, current, state=StreamState.FINALIZED, digest=digest)
+
+            with self._database.write() as connection:
+                sealed = once(connection, request, _MEMORY, partial(act, connection))
             self._recordings.delete(record.uid)
             return sealed
 
-    def delete(self, stream_id: str) -> None:
-        """Forget a recording; raises `StateError` STREAM_IN_USE while a build reads it.
+    def delete(self, stream_id: str, etag: str = "", request: RequestId | None = None) -> None:
+        """Forget a recording; its blobs are left to the sweep.
 
-        Its blobs are left to the sweep.
+        Raises:
+            StateError: STREAM_IN_USE, a build reads it.
+            ConflictError: ETAG_MISMATCH.
         """
-        with self._locks.holding(stream_id), self._database.write() as connection:
+
+        def act(connection: Connection) -> EventStreamRecord:
             record = _get(connection, stream_id)
+            check_etag(record.etag, etag)
             if _is_in_use(connection, stream_id):
                 raise StateError(stream_id, "no build", "one at work", reason="STREAM_IN_USE")
             connection.execute(delete(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid))
-        self._recordings.delete(record.uid)
+            return record
+
+        with self._locks.holding(stream_id), self._database.write() as connection:
+            deleted = once(connection, request, _MEMORY, partial(act, connection))
+        self._recordings.delete(deleted.uid)
 
     def event_file(self, record: EventStreamRecord) -> Path:
         """The sealed chunks of a finalized recording."""

@@ -11,6 +11,7 @@ from typing import Any
 from sqlalchemy import Connection, Select, delete, exists, func, insert, select, update
 
 from roel_service.errors import ConflictError, NotFoundError, StateError
+from roel_service.store.etags import check_etag
 from roel_service.store.records import (
     UNFINISHED,
     USABLE,
@@ -115,14 +116,8 @@ def forget_map(connection: Connection, map_id: str) -> None:
 def get_current_map(connection: Connection, map_id: str, etag: str) -> MapRecord:
     """One map that lives and has the etag; raises as `get_map` and `check_etag`."""
     record = get_map(connection, map_id)
-    check_etag(record, etag)
+    check_etag(record.etag, etag)
     return record
-
-
-def check_etag(record: MapRecord, etag: str) -> None:
-    """Raise `ConflictError` ETAG_MISMATCH unless the etag is empty or the map's own."""
-    if etag and etag != record.etag:
-        raise ConflictError("etag", record.etag, etag, reason="ETAG_MISMATCH")
 
 
 def check_state(version: MapVersionRecord, wanted: Sequence[VersionState]) -> None:

@@ -15,11 +15,11 @@ from sqlalchemy import Connection, delete, select
 from roel_service.errors import LimitError, StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
+from roel_service.store.etags import check_etag
 from roel_service.store.map_rows import (
     LATEST,
     change_map,
     change_version,
-    check_etag,
     check_state,
     check_unused,
     find_map,
@@ -146,7 +146,7 @@ class Maps:
             if not record.is_deleted:
                 reason = "MAP_NOT_DELETED"
                 raise StateError(map_id, "a deleted map", "one that is not", reason=reason)
-            check_etag(record, etag)
+            check_etag(record.etag, etag)
             return change_map(connection, record, {"delete_time_us": 0, "purge_time_us": 0})
 
         return self._changed(request, act)
@@ -161,7 +161,7 @@ class Maps:
 
         def act(connection: Connection) -> MapRecord:
             record = find_map(connection, map_id)
-            check_etag(record, etag)
+            check_etag(record.etag, etag)
             check_unused(connection, map_id)
             forget_map(connection, map_id)
             return record
@@ -223,7 +223,7 @@ class Maps:
             return [map_version_from_row(row) for row in rows.mappings()]
 
     def delete_version(
-        self, map_id: str, label: int | str, request: RequestId | None
+        self, map_id: str, number: int, request: RequestId | None
     ) -> MapVersionRecord:
         """Delete a version.
 
@@ -234,7 +234,7 @@ class Maps:
 
         def act(connection: Connection) -> MapVersionRecord:
             record = get_map(connection, map_id)
-            version = get_version(connection, record, label)
+            version = get_version(connection, record, number)
             check_state(version, (*USABLE, VersionState.CREATING, VersionState.FAILED))
             check_unused(connection, map_id, version.version)
             aliases = {name for name in record.aliases if record.aliases[name] == version.version}

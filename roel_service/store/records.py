@@ -95,6 +95,10 @@ class EventStreamRecord:
     longest_gap_us: int
     create_time_us: int
 
+    @property
+    def etag(self) -> str:
+        return f"{self.uid[:8]}-{self.chunk_count}-{self.pose_count}-{self.state.value}"
+
 
 @dataclass(frozen=True, kw_only=True)
 class MapRecord:

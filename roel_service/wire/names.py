@@ -66,6 +66,14 @@ def map_version_id(name: str) -> tuple[str, VersionLabel]:
     return map_id(match[1]), int(match[2]) if match[2] else match[3]
 
 
+def map_version_number(name: str) -> tuple[str, int]:
+    """Map id and number in a version's name; raises `InputError` for an alias, which may move."""
+    found_id, label = map_version_id(name)
+    if not isinstance(label, int):
+        raise _bad_name(name, f"{PROJECT}/maps/ID/versions/vNUMBER")
+    return found_id, label
+
+
 def checked_alias(value: str) -> str:
     """`value` if a caller may choose it as an alias; raises `InputError` ID_INVALID otherwise."""
     if value == LATEST or _NUMBER.fullmatch(value):

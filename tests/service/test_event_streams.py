@@ -1,4 +1,5 @@
 import dataclasses
+import uuid
 from contextlib import ExitStack
 
 import cv2
@@ -374,3 +375,25 @@ def test_a_preview_shows_where_events_were(client, call, stream):
     answer = call("PreviewEvents", request)
     assert answer.event_count == 0
     assert answer.png.startswith(b"\x89PNG")
+
+
+def test_the_same_request_id_opens_and_deletes_once(connection):
+    stub = events_pb2_grpc.EventStreamServiceStub(connection.channel)
+    stream_id = new_id()
+    create = events_pb2.CreateEventStreamRequest(
+        parent="projects/default",
+        event_stream_id=stream_id,
+        event_stream=events_pb2.EventStream(camera=camera_to_proto(CAMERA)),
+        request_id=str(uuid.uuid4()),
+    )
+    opened = connection.call(stub.CreateEventStream, create)
+    assert connection.call(stub.CreateEventStream, create) == opened
+    delete = events_pb2.DeleteEventStreamRequest(name=opened.name, etag="stale")
+    with pytest.raises(ConflictError) as caught:
+        connection.call(stub.DeleteEventStream, delete)
+    assert caught.value.reason == "ETAG_MISMATCH"
+    delete = events_pb2.DeleteEventStreamRequest(
+        name=opened.name, etag=opened.etag, request_id=str(uuid.uuid4())
+    )
+    for _ in range(2):
+        connection.call(stub.DeleteEventStream, delete)

@@ -3,9 +3,11 @@ from contextlib import closing
 
 import pytest
 
-from roel_service.errors import InputError, NotFoundError
+from roel_service.errors import ConflictError, InputError, NotFoundError
 from roel_service.store.requests import RequestId
 from roel_service.store.store import Store
+
+from .samples import CAMERA, LIMIT_BYTES, chunk
 
 
 def request(number=1, content="a"):
@@ -54,3 +56,31 @@ def test_requests_of_long_ago_are_forgotten(store, folder):
     with closing(sqlite3.connect(folder / "rows.sqlite")) as connection, connection:
         connection.execute("UPDATE request SET expire_time_us = 1")
     assert store.maps.create("attic", request=request(content="b")).id == "attic"
+
+
+def test_a_recording_is_opened_frozen_and_deleted_once(store):
+    streams = store.event_streams
+    opened = streams.create("walk", CAMERA, request(1))
+    assert streams.create("walk", CAMERA, request(1)) == opened
+    streams.append_chunks("walk", streams.take_over("walk").fence, [chunk(0)], LIMIT_BYTES)
+    sealed = streams.finalize("walk", request=request(2))
+    assert streams.finalize("walk", request=request(2)) == sealed
+    streams.delete("walk", sealed.etag, request(3))
+    streams.delete("walk", sealed.etag, request(3))
+    assert streams.finalize("walk", request=request(2)) == sealed
+    with pytest.raises(NotFoundError):
+        streams.get("walk")
+    with pytest.raises(InputError) as caught:
+        streams.delete("walk", "", request(3, content="b"))
+    assert caught.value.reason == "REQUEST_ID_REUSED"
+
+
+def test_a_recording_that_has_grown_has_another_etag(store):
+    streams = store.event_streams
+    opened = streams.create("walk", CAMERA)
+    streams.append_chunks("walk", streams.take_over("walk").fence, [chunk(0)], LIMIT_BYTES)
+    for change in (streams.finalize, streams.delete):
+        with pytest.raises(ConflictError) as caught:
+            change("walk", opened.etag)
+        assert caught.value.reason == "ETAG_MISMATCH"
+    assert streams.finalize("walk", streams.get("walk").etag).digest

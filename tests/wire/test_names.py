@@ -56,6 +56,14 @@ def test_there_is_one_project():
         names.check_parent("projects/other")
 
 
+def test_where_an_alias_could_move_a_number_is_needed():
+    name = names.map_version_name("house", 12)
+    assert names.map_version_number(name) == ("house", 12)
+    with pytest.raises(InputError) as caught:
+        names.map_version_number(names.map_version_name("house", "live"))
+    assert caught.value.reason == "NAME_INVALID"
+
+
 @pytest.mark.parametrize("alias", ["latest", "v1", "v123", "ab", "Live", ""])
 def test_an_alias_is_an_id_but_neither_latest_nor_a_number(alias):
     assert names.checked_alias("live") == "live"
