@@ -21,6 +21,7 @@ from roel_bench.methods import PEERS
 from roel_bench.results import NO_DISTURBANCE, Results, Row, read_results
 from roel_bench.suites import FRONT_END, MAP, PRESET_NAMES
 from roel_bench.tables import (
+    CURVE_COLUMNS,
     FRAME_COLUMNS,
     MAP_COLUMNS,
     MISSING,
@@ -93,8 +94,9 @@ def document(results: Results) -> str:
         _velocity_invariance(report),
         _seconds(report),
         _recordings(report),
+        _curves(report),
     )
-    return "\n".join([INTRODUCTION, *sections])
+    return "\n".join([INTRODUCTION, *(section for section in sections if section)])
 
 
 def _section(title: str, text: str, *tables: str) -> str:
@@ -434,6 +436,23 @@ def _recordings(report: _Report) -> str:
         table(["recording", "method", *POSED_FIGURES], posed),
         table(["recording", *FRAME_HEADINGS], poseless),
     )
+
+
+def _curves(report: _Report) -> str:
+    """Maps with curves beside those without; nothing where none was made."""
+    names = [variant.name for variant in variants.CURVE_VARIANTS]
+    scenes = {row.scene for row in report.rows if row.method in names}
+    lines = [
+        [f"{row.method}, {row.scene}", *figure_cells([row], (*MAP_COLUMNS, *CURVE_COLUMNS))]
+        for row in report.rows
+        if row.scene in scenes and row.method in ("default", *names) and row.task == MAP
+    ]
+    text = (
+        "Rooms of round tables, pots, mirrors and an arch. *Round* are the true edge points along"
+        " rims, and the points of the map that are nearest to one; the others are *straight*."
+    )
+    headings = ["map", *MAP_HEADINGS, *(heading for heading, _, _ in CURVE_COLUMNS)]
+    return _section("Round edges", text, table(headings, lines)) if lines else ""
 
 
 POSED_FIGURES = (

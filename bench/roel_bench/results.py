@@ -124,9 +124,14 @@ def _processor() -> str:
 
 
 def config_digest(config: Config) -> str:
-    """Twelve hexadecimal digits that change with any parameter of mapping."""
+    """Twelve hexadecimal digits that change with any parameter of mapping.
+
+    A stage that is off leaves no trace: rows from before there was one stay valid.
+    """
     tables = to_tables(config)
     del tables["runtime"], tables["register"]
+    if config.curves.method == "none":
+        del tables["curves"]
     return digest_of(json.dumps(tables, sort_keys=True))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from roel_bench.catalogue import (
+    CURVED_ROOMS,
     LARGE_ROOMS,
     POSED_RECORDINGS,
     POSELESS_RECORDINGS,
@@ -18,6 +19,7 @@ from roel_bench.disturbances import DISTURBANCES, NOISY_POSES
 from roel_bench.methods import PEERS
 from roel_bench.results import NO_DISTURBANCE
 from roel_bench.variants import (
+    CURVE_VARIANTS,
     FRONT_END_VARIANTS,
     MAP_ABLATION,
     PRESET_VARIANTS,
@@ -70,6 +72,7 @@ NOISE_SUITE = [
 ]
 FRONT_END_SUITE = _cells(FRONT_END, FRONT_END_ROOMS, _names(FRONT_END_VARIANTS))
 PEERS_SUITE = _cells(MAP, TUNING_ROOMS + REPORTING_ROOMS, ["default", *PEERS])
+CURVES_SUITE = _cells(MAP, CURVED_ROOMS, ["default", *_names(CURVE_VARIANTS)])
 QUICK_SUITE = [
     *_cells(MAP, [TINY_ROOM], PRESET_NAMES),
     *_cells(MAP, [TINY_ROOM], ["default"], "noise_events"),
@@ -83,12 +86,14 @@ SUITES = {
     "noise": NOISE_SUITE,
     "front-end": FRONT_END_SUITE,
     "peers": PEERS_SUITE,
+    "curves": CURVES_SUITE,
     "full": [
         *PRESETS_SUITE,
         *NOISE_SUITE,
         *PEERS_SUITE,
         *FRONT_END_SUITE,
         *ABLATION_SUITE,
+        *CURVES_SUITE,
     ],
 }
 

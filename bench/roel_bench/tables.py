@@ -26,6 +26,17 @@ RECORDING_COLUMNS = (
     ("true lines covered", "covered_line_share", 2),
     ("held-back events explained", "held_back_explained_share", 2),
 )
+# What rooms of round things have beside the others.
+CURVE_COLUMNS = (
+    ("round: points", "curved_edge_count", 0),
+    ("recall 5", "curved_recall_5", 3),
+    ("recall 10", "curved_recall_10", 3),
+    ("recall 20", "curved_recall_20", 3),
+    ("precision 20", "curved_precision_20", 3),
+    ("offset, mm", "curved_offset_median_mm", 1),
+    ("completion, mm", "curved_completion_mm", 0),
+    ("straight: recall 20", "straight_recall_20", 3),
+)
 FRAME_COLUMNS = (
     ("lines a frame", "lines_per_frame", 0),
     ("precision", "precision", 3),
@@ -70,20 +81,27 @@ def figure_cells(rows: Sequence[Row], columns: Sequence[Column]) -> list[str]:
 
 def all_rows(results: Results) -> str:
     """Every row of a run, maps first."""
-    blocks = []
-    for task, title, columns in (
-        (MAP, "Maps", (*MAP_COLUMNS, *RECORDING_COLUMNS)),
-        (FRONT_END, "Lines of single frames", FRAME_COLUMNS),
-    ):
-        rows = results.select(lambda row, task=task: row.task == task)  # type: ignore[misc]
-        if rows:
-            headings = ["scene", "disturbance", "method", *(name for name, _, _ in columns)]
-            cells = (
-                [row.scene, row.disturbance, _method_cell(row), *figure_cells([row], columns)]
-                for row in rows
-            )
-            blocks.append(f"## {title}\n\n{table(headings, cells)}\n")
-    return "\n".join(blocks)
+    maps = results.select(lambda row: row.task == MAP)
+    round_things = [row for row in maps if "curved_edge_count" in row.figures]
+    frames = results.select(lambda row: row.task == FRONT_END)
+    blocks = (
+        _block("Maps", maps, (*MAP_COLUMNS, *RECORDING_COLUMNS)),
+        _block("Round edges", round_things, CURVE_COLUMNS),
+        _block("Lines of single frames", frames, FRAME_COLUMNS),
+    )
+    return "\n".join(block for block in blocks if block)
+
+
+def _block(title: str, rows: Sequence[Row], columns: Sequence[Column]) -> str:
+    """A headed table with a line a row; nothing where there are no rows."""
+    if not rows:
+        return ""
+    headings = ["scene", "disturbance", "method", *(name for name, _, _ in columns)]
+    cells = (
+        [row.scene, row.disturbance, _method_cell(row), *figure_cells([row], columns)]
+        for row in rows
+    )
+    return f"## {title}\n\n{table(headings, cells)}\n"
 
 
 def failures(rows: Iterable[Row]) -> str:

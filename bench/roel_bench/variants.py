@@ -7,7 +7,7 @@ from typing import Any
 
 from roel_service.config.load import Tables, with_tables
 from roel_service.config.presets import PRESETS, UNLIMITED, preset
-from roel_service.config.stages import Config
+from roel_service.config.stages import CURVE_METHODS, Config
 from roel_service.errors import ConfigError
 
 
@@ -93,6 +93,13 @@ DEFAULT_ABLATION = (
     _without("support filter", trim={"min_support_ratio": 0.0}),
     _without("frame count filter", trim={"min_frame_count": 1}),
     _without("overlap removal", trim={"overlap_distance_m": 0.0}),
+)
+
+# Curved edges, which the default leaves to its lines.
+CURVE_VARIANTS = tuple(
+    Variant(name=f"default with curves ({method})", changes={"curves": {"method": method}})
+    for method in CURVE_METHODS
+    if method != "none"
 )
 
 # The paper's pixel counts of its two windows are those of its data sets; these are ours.
@@ -227,7 +234,13 @@ FRONT_END_VARIANTS = (
 
 VARIANTS = {
     variant.name: variant
-    for variant in (*PRESET_VARIANTS, REFINED_POSES, *MAP_ABLATION, *FRONT_END_VARIANTS)
+    for variant in (
+        *PRESET_VARIANTS,
+        REFINED_POSES,
+        *MAP_ABLATION,
+        *CURVE_VARIANTS,
+        *FRONT_END_VARIANTS,
+    )
 }
 
 

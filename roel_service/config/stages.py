@@ -21,6 +21,7 @@ TRIANGULATE_GATES = ("pixel", "grassmann")
 REFINE_RESIDUALS = ("pixel", "grassmann", "reprojection")
 REFINE_LOSSES = ("cauchy", "squared", "quartic")
 TRIM_METHODS = ("coverage", "cluster")
+CURVE_METHODS = ("none", "polyline", "bezier")
 
 
 @dataclass(frozen=True)
@@ -433,6 +434,39 @@ class RuntimeConfig(Stage, table="runtime"):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CurvesConfig(Stage, table="curves"):
+    """Curved edges as polylines, beside the lines of the map.
+
+    Attributes:
+        method: `none`, or what a chain of points is fitted as before it is cut into segments:
+            `polyline` or `bezier`, a cubic curve.
+        piece_length_px: edges are cut into pieces of about this length.
+        frame_stride: chains are looked for in every so many of the frames that have pieces.
+        reach_frame_count: how many frames before and behind say how deep a point lies.
+        max_distance_px: of a point's image from a piece.
+        min_frame_count: frames that saw a point.
+        min_support_ratio: frames that saw a point against frames that could have.
+        max_rms_px: largest residual of a point.
+        max_sigma_m: largest standard deviation of a point across the curve.
+        max_error_px: of the segments from the curve, at the viewing distance.
+        overlap_distance_px: what lies this close along a line, or along a curve that more frames
+            saw, is left out.
+    """
+
+    method: str = parameter("none", one_of(CURVE_METHODS))
+    piece_length_px: float = parameter(10.0, Rule(">= 5", lambda value: value >= 5))
+    frame_stride: int = parameter(3, POSITIVE)
+    reach_frame_count: int = parameter(36, at_most(1000))
+    max_distance_px: float = parameter(2.0, POSITIVE)
+    min_frame_count: int = parameter(8, POSITIVE)
+    min_support_ratio: float = parameter(0.6, SHARE)
+    max_rms_px: float = parameter(0.6, POSITIVE)
+    max_sigma_m: float = parameter(0.1, POSITIVE)
+    max_error_px: float = parameter(0.6, POSITIVE)
+    overlap_distance_px: float = parameter(2.5, NOT_NEGATIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Config:
     """Every parameter of a run, one attribute for each TOML table."""
 
@@ -446,3 +480,10 @@ class Config:
     trim: TrimConfig = TrimConfig()
     register: RegisterConfig = RegisterConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+    curves: CurvesConfig = CurvesConfig()
+
+    def __post_init__(self) -> None:
+        # Depths of curves come from speeds of which the rotation is undone.
+        if self.curves.method != "none" and not self.frames.compensate_rotation:
+            expected = "none without frames.compensate_rotation"
+            raise ConfigError("curves.method", expected, self.curves.method)

@@ -76,11 +76,18 @@ class EDLines:
         self._params.Sigma = 0.0
 
     def detect(self, grey: Array) -> FloatArray:
+        return _segments(self._drawn(grey).detectLines())
+
+    def chains(self, grey: Array) -> list[Array]:
+        """(n, 2) int pixels of each edge, neighbour by neighbour, before lines are looked for."""
+        return [np.asarray(chain) for chain in self._drawn(grey).getSegments()]
+
+    def _drawn(self, grey: Array) -> cv2.ximgproc.EdgeDrawing:
         # A detector keeps the last image's edges; a new one makes calls from threads independent.
         drawing = cv2.ximgproc.createEdgeDrawing()
         drawing.setParams(self._params)
         drawing.detectEdges(grey)
-        return _segments(drawing.detectLines())
+        return drawing
 
 
 class LSD:

@@ -21,6 +21,8 @@ from roel_service.scene.trajectory import Trajectory
 
 # Polarity label of what both polarities show.
 UNKNOWN_POLARITY = 0
+# Half of the time step over which the camera's velocity is measured.
+VELOCITY_HALF_STEP_US = 5_000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,6 +69,15 @@ class EventFrame:
     windows: tuple[tuple[int, int], ...]
     width: int
     height: int
+
+
+def velocities(frames: Frames, trajectory: Trajectory) -> FloatArray:
+    """(N, 3) camera velocity at each frame, m/s, world."""
+    limits = trajectory.t_us[[0, -1]]
+    before = np.clip(frames.t_us - VELOCITY_HALF_STEP_US, *limits)
+    after = np.clip(frames.t_us + VELOCITY_HALF_STEP_US, *limits)
+    moved = trajectory.interpolate(after).translation - trajectory.interpolate(before).translation
+    return moved / ((after - before) * 1e-6)[:, None]
 
 
 def frame_times(

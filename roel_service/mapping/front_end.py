@@ -18,7 +18,8 @@ from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import Config
 from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
-from roel_service.mapping.detect import LineDetector, detect_lines
+from roel_service.mapping.curve_pieces import FRAME_STEP, pieces_of_frame
+from roel_service.mapping.detect import EDLines, LineDetector, detect_lines
 from roel_service.mapping.evidence import Evidence, evidence_of, supporting_forms
 from roel_service.mapping.frames import (
     Frames,
@@ -29,6 +30,7 @@ from roel_service.mapping.frames import (
 )
 from roel_service.mapping.match_points import images_to_match
 from roel_service.mapping.plane_fit import (
+    NO_LINES,
     FittedLines,
     fit_space_time_planes,
     observations_of_frames,
@@ -49,12 +51,14 @@ class Detected:
         frames: N frames that were looked at.
         observations: M lines, without their events.
         evidence: what the costs need of them.
+        pieces: short pieces of edges where no line is, for `curves`; none where that is off.
         images: by frame, those that point matches are to be found in.
     """
 
     frames: Frames
     observations: LineObservations
     evidence: Evidence
+    pieces: LineObservations
     images: dict[int, tuple[Array, ...]]
 
 
@@ -66,6 +70,7 @@ class FrameLines:
     fitted: FittedLines
     event_forms: FloatArray
     event_counts: Array
+    pieces: FittedLines
     images: tuple[Array, ...]
     detect_s: float
     plane_fit_s: float
@@ -93,6 +98,7 @@ class FrameReader:
         self._camera = camera
         self._config = config
         self._detector = detector
+        self._drawing = None if config.curves.method == "none" else EDLines(config.detect)
         self._ideal_px = undistortion_table(camera)
 
     def covering(self, trajectory: Trajectory) -> FrameReader:
@@ -115,11 +121,15 @@ class FrameReader:
             config.frames,
             config.detect,
         )
-        seeds = detect_lines(event_images(frame, config.detect), self._detector, config.detect)
+        drawn = list(event_images(frame, config.detect))
+        seeds = detect_lines(drawn, self._detector, config.detect)
         images = images_to_match(index, frame, config)
         detected = time.perf_counter()
         rng = np.random.default_rng(np.random.SeedSequence(config.runtime.seed, spawn_key=(index,)))
         fitted = fit_space_time_planes(seeds, frame, config.plane_fit, rng)
+        pieces = NO_LINES
+        if self._drawing is not None and index % FRAME_STEP == 0:
+            pieces = pieces_of_frame(drawn, fitted, frame, self._drawing, config)
         # The events end here: memory grows with the lines, not with the recording.
         forms = supporting_forms(
             observations_of_frames([fitted]),
@@ -133,6 +143,7 @@ class FrameReader:
             fitted=fitted.without_events(),
             event_forms=forms,
             event_counts=np.diff(fitted.event_offsets),
+            pieces=pieces,
             images=images,
             detect_s=detected - started,
             plane_fit_s=time.perf_counter() - detected,
@@ -191,6 +202,7 @@ def lines_of_all_frames(
             np.concatenate([np.empty((0, 6, 6)), *(lines.event_forms for lines in done)]),
             np.concatenate([np.empty(0, np.int64), *(lines.event_counts for lines in done)]),
         ),
+        pieces=observations_of_frames([lines.pieces for lines in done]),
         images={index: lines.images for index, lines in enumerate(done)},
     )
 

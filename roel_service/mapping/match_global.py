@@ -20,7 +20,7 @@ from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
-from roel_service.mapping.frames import Frames
+from roel_service.mapping.frames import Frames, velocities
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.trim import covered_spans
 from roel_service.mapping.views import Views, end_residuals_px
@@ -40,8 +40,6 @@ MIN_PROJECTION_PX = 5.0
 COMPETITION_PX = 0.3
 # Decimals of that cost, px, that tell lines apart.
 COST_DECIMALS = 6
-# Half of the time step over which the camera's velocity is measured.
-VELOCITY_HALF_STEP_US = 5_000
 
 
 def reassociate(
@@ -67,7 +65,7 @@ def reassociate(
         progress: called once a round; may raise `Cancelled`.
     """
     settings = config.match_global
-    velocity = _velocities(frames, trajectory) if config.frames.compensate_rotation else None
+    velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
     round_count = len(settings.max_distances_px)
     for index, max_distance_px in enumerate(settings.max_distances_px):
         progress(index, round_count)
@@ -122,15 +120,6 @@ def _held(
 def _usable(refined: Refined) -> Refined:
     """Without the lines that diverged."""
     return refined.take(~refined.diverged)
-
-
-def _velocities(frames: Frames, trajectory: Trajectory) -> FloatArray:
-    """(N, 3) camera velocity at each frame, m/s, world."""
-    limits = trajectory.t_us[[0, -1]]
-    before = np.clip(frames.t_us - VELOCITY_HALF_STEP_US, *limits)
-    after = np.clip(frames.t_us + VELOCITY_HALF_STEP_US, *limits)
-    moved = trajectory.interpolate(after).translation - trajectory.interpolate(before).translation
-    return moved / ((after - before) * 1e-6)[:, None]
 
 
 def _associate(

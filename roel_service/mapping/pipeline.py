@@ -8,6 +8,7 @@ import numpy as np
 
 from roel_service.config.stages import Config
 from roel_service.mapping.cached_stages import CachedStages, triangulation_cost
+from roel_service.mapping.curves import with_curves
 from roel_service.mapping.detect import LineDetector, line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
@@ -114,6 +115,8 @@ def build_line_map(
                 refined, evidence, observations, frames, trajectory, config, run.step
             )
 
+    if config.curves.method != "none":
+        cache = NO_CACHE  # it does not keep the pieces of edges
     stages = CachedStages(run, cache, config)
     detected = stages.detected(detect, counted, trajectory, camera)
     frames, observations, evidence = detected.frames, detected.observations, detected.evidence
@@ -131,7 +134,9 @@ def build_line_map(
     with run.stage("trim"):
         line_map, dropped = trim_to_segments(refined, evidence.views, frames, config.trim)
         run.count(dropped)
-    run.count([TrackStatus.TRIANGULATED] * len(line_map))
+        run.count([TrackStatus.TRIANGULATED] * len(line_map))
+        if config.curves.method != "none":
+            line_map = with_curves(line_map, detected.pieces, frames, trajectory, config, run.step)
     return MappingResult(
         line_map=line_map,
         trajectory=trajectory,

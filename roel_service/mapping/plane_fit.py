@@ -53,6 +53,16 @@ class FittedLines:
         )
 
 
+NO_LINES = FittedLines(
+    segments_px=np.empty((0, 2, 2)),
+    polarity=np.empty(0, np.int8),
+    normal_speed_px_per_ms=np.empty(0),
+    event_offsets=np.zeros(1, np.int64),
+    event_xy_px=np.empty((0, 2), np.float32),
+    event_dt_us=np.empty(0, np.int32),
+)
+
+
 def fit_space_time_planes(
     seeds: Seeds, frame: EventFrame, config: PlaneFitConfig, rng: np.random.Generator
 ) -> FittedLines:

@@ -16,6 +16,7 @@ from roel_service.arrays import Array
 from roel_service.mapping.evidence import evidence_of
 from roel_service.mapping.frames import frames_at
 from roel_service.mapping.front_end import Detected
+from roel_service.mapping.plane_fit import observations_of_frames
 from roel_service.mapping.refine import Refined
 from roel_service.mapping.run import CountedEvents
 from roel_service.scene.camera import Camera
@@ -90,6 +91,7 @@ def detected_from_arrays(
         frames=frames,
         observations=observations,
         evidence=evidence_of(observations, frames, arrays["event_forms"], arrays["event_counts"]),
+        pieces=observations_of_frames([]),
         images=images,
     )
 

@@ -2,11 +2,12 @@ import pytest
 
 from roel_bench import report
 from roel_bench.acceptance import CRITERIA, Maps
-from roel_bench.catalogue import LARGE_ROOMS, SMALL_ROOMS
+from roel_bench.catalogue import CURVED_ROOMS, LARGE_ROOMS, SMALL_ROOMS
 from roel_bench.disturbances import NOISY_POSES
 from roel_bench.results import NO_DISTURBANCE, Results, read_results, write_results
 from roel_bench.suites import FRONT_END
-from roel_bench.variants import DEFAULT_ABLATION, VARIANTS
+from roel_bench.tables import all_rows
+from roel_bench.variants import CURVE_VARIANTS, DEFAULT_ABLATION, VARIANTS
 from tests.bench.samples import row
 
 LARGE, SMALL = LARGE_ROOMS[0], SMALL_ROOMS[0]
@@ -160,3 +161,19 @@ def test_a_peer_that_failed_is_told_and_counts_in_no_mean():
     assert f"LIMAP: best_10 has no map of {SMALL}: PEER_FAILED: exit code -6: abort." in page
     assert "LIMAP: best_10, 640x480, 1 rooms" in page
     assert "LIMAP: best_10, 346x260" not in page
+
+
+def test_round_edges_are_told_of_where_they_were_mapped():
+    assert "## Round edges" not in report.document(RESULTS)
+    room, method = CURVED_ROOMS[0], CURVE_VARIANTS[0].name
+    curved = {"curved_edge_count": 9000, "curved_recall_20": 0.25}
+    rows = (
+        row(room, figures=figures(0.3) | curved),
+        row(room, method=method, figures=figures(0.33) | curved | {"curved_recall_20": 0.45}),
+    )
+    results = Results(machine=RESULTS.machine, versions={}, rows=(*ROWS, *rows))
+    page = report.document(results)
+    section = page.partition("## Round edges")[2]
+    assert "| 0.250 |" in line_of(section, f"default, {room}")
+    assert "| 0.450 |" in line_of(section, f"{method}, {room}")
+    assert "## Round edges" in all_rows(results)

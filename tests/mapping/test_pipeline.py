@@ -9,6 +9,7 @@ import pytest
 from roel_service.config.presets import preset
 from roel_service.config.stages import (
     Config,
+    CurvesConfig,
     DetectConfig,
     FramesConfig,
     MatchGlobalConfig,
@@ -332,3 +333,13 @@ class TestDegenerate:
     def test_blind_detection_thresholds_find_nothing(self):
         config = dataclasses.replace(CONFIG, detect=DetectConfig(min_length_px=500.0))
         assert built(config=config).report.observation_count == 0
+
+
+def test_curves_leave_the_lines_as_they_are(result):
+    """Every byte of them; with no curve in the world hardly anything is added."""
+    config = dataclasses.replace(CONFIG, curves=CurvesConfig(method="polyline"))
+    with_curves = built(config=config).line_map
+    count = len(result.line_map)
+    for name, column in vars(result.line_map).items():
+        assert getattr(with_curves, name)[:count].tobytes() == column.tobytes()
+    assert len(with_curves) <= 1.2 * count

@@ -10,7 +10,7 @@ from roel_client.cli.output import print_result, progress_bar
 from roel_client.cli.parser import Command, Subparsers, command, command_group, one_of
 from roel_client.cli.staging import Staged
 
-SUITES = ("quick", "presets", "ablation", "noise", "front-end", "peers", "full")
+SUITES = ("quick", "presets", "ablation", "noise", "front-end", "peers", "curves", "full")
 
 
 def add_commands(subparsers: Subparsers) -> None:
