@@ -440,7 +440,7 @@ class CurvesConfig(Stage, table="curves"):
     Attributes:
         method: `none`, or what a chain of points is fitted as before it is cut into segments:
             `polyline` or `bezier`, a cubic curve.
-        piece_length_px: edges are cut into pieces of about this length.
+        piece_length_px: edges are cut into pieces of about this length, five pixels at the least.
         frame_stride: chains are looked for in every so many of the frames that have pieces.
         reach_frame_count: how many frames before and behind say how deep a point lies.
         max_distance_px: of a point's image from a piece.
@@ -454,7 +454,7 @@ class CurvesConfig(Stage, table="curves"):
     """
 
     method: str = parameter("none", one_of(CURVE_METHODS))
-    piece_length_px: float = parameter(10.0, Rule(">= 5", lambda value: value >= 5))
+    piece_length_px: float = parameter(10.0, POSITIVE)
     frame_stride: int = parameter(3, POSITIVE)
     reach_frame_count: int = parameter(36, at_most(1000))
     max_distance_px: float = parameter(2.0, POSITIVE)
@@ -481,9 +481,3 @@ class Config:
     register: RegisterConfig = RegisterConfig()
     runtime: RuntimeConfig = RuntimeConfig()
     curves: CurvesConfig = CurvesConfig()
-
-    def __post_init__(self) -> None:
-        # Depths of curves come from speeds of which the rotation is undone.
-        if self.curves.method != "none" and not self.frames.compensate_rotation:
-            expected = "none without frames.compensate_rotation"
-            raise ConfigError("curves.method", expected, self.curves.method)

@@ -47,7 +47,7 @@ def pieces_of_frame(
         drawing: draws edges.
         config: `curves`, and `detect` and `plane_fit` for what pieces share with lines.
     """
-    length_px = config.curves.piece_length_px
+    length_px = max(config.curves.piece_length_px, MIN_PIXEL_COUNT)
     pieces = np.concatenate(
         [np.empty((0, 2, 2)), *(cut(drawing.chains(image.grey), length_px) for image in images)]
     )

@@ -126,6 +126,9 @@ def _field(
     )
     R = frames.T_world_camera.rotation
     velocity = 1e-3 * velocities(frames, trajectory)
+    # Speeds that hold the camera's rotation say nothing about depths.
+    tells_depth = config.frames.compensate_rotation
+    max_speed_difference = config.match_global.max_speed_difference_px_per_ms
     return Field(
         start=start,
         members=members,
@@ -145,7 +148,7 @@ def _field(
         cy=float(frames.K[1, 2]),
         width=frames.width,
         height=frames.height,
-        max_speed_difference=config.match_global.max_speed_difference_px_per_ms,
+        max_speed_difference=max_speed_difference if tells_depth else np.inf,
     )
 
 

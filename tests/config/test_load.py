@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from roel_service.config.load import load_config, read_tables, to_tables, to_toml, with_tables
 from roel_service.config.presets import PRESETS, preset
 from roel_service.config.stages import (
+    CURVE_METHODS,
     DETECTORS,
     MATCH_GLOBAL_METHODS,
     MATCHERS,
@@ -30,6 +31,7 @@ CHOICES = {
     "refine.residual": REFINE_RESIDUALS,
     "refine.loss": REFINE_LOSSES,
     "trim.method": TRIM_METHODS,
+    "curves.method": CURVE_METHODS,
 }
 
 

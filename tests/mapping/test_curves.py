@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from roel_service.config.stages import Config, CurvesConfig, FramesConfig
-from roel_service.errors import ConfigError
 from roel_service.geometry import projection
 from roel_service.mapping import curves
 from roel_service.mapping.curve_pieces import FRAME_STEP
@@ -125,9 +124,19 @@ def test_a_camera_in_one_place_finds_no_depth():
     assert len(mapped(pieces, still)) == 0
 
 
-def test_curves_need_frames_without_rotation():
-    with pytest.raises(ConfigError, match=r"curves\.method"):
-        Config(frames=FramesConfig(compensate_rotation=False), curves=CurvesConfig(method="bezier"))
+def test_speeds_that_hold_the_rotation_are_not_asked(sight):
+    pieces, frames = sight
+    wrong = dataclasses.replace(
+        pieces,
+        normal_speed_px_per_ms=np.full(len(pieces), 10.0),
+        event_offsets=pieces.event_offsets,
+    )
+    raw = dataclasses.replace(CONFIG, frames=FramesConfig(compensate_rotation=False))
+    for config, count in ((CONFIG, 0), (raw, 1)):
+        found = curves.with_curves(
+            NO_LINES, wrong, frames, trajectory(), config, lambda done, total: None
+        )
+        assert min(len(found), 1) == count
 
 
 def test_vertices_keep_all_points_within_the_error():
