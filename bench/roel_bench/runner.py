@@ -22,7 +22,7 @@ from roel_bench.front_end import (
     lines_of_frames,
     run_front_end,
 )
-from roel_bench.methods import PEERS, Method, find_method
+from roel_bench.methods import Method, find_method
 from roel_bench.pictures import draw_frames, draw_map
 from roel_bench.results import (
     FILE_NAME,
@@ -36,7 +36,7 @@ from roel_bench.results import (
 )
 from roel_bench.scenes import MapTruth, Scene
 from roel_bench.scores import score
-from roel_bench.suites import FRONT_END, PRESET_NAMES, Cell
+from roel_bench.suites import DRAWN_METHODS, FRONT_END, PRESET_NAMES, Cell
 from roel_bench.variants import find_variant
 from roel_service.errors import InputError, NoAnswerError, NotFoundError
 from roel_service.progress import Progress, ProgressCallback, ignore
@@ -144,7 +144,7 @@ class Runner:
             return _failed(cell, scene, method, error)
         peak_rss_mib = memory.peak_mib()
         figures = score(scene, mapped.entities)
-        if cell.disturbance == NO_DISTURBANCE and cell.method in (*PRESET_NAMES, *PEERS):
+        if cell.disturbance == NO_DISTURBANCE and cell.method in DRAWN_METHODS:
             title = f"{cell.method} on {cell.scene}: {len(mapped.entities)} entities"
             draw_map(scene, mapped.entities, title, self._picture(cell))
         return Row(

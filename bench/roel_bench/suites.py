@@ -33,6 +33,8 @@ MAP, FRONT_END = "map", "front_end"
 # The tables of single frames have many rows, and the paper's are of one scene.
 FRONT_END_ROOMS = LARGE_ROOMS[:1] + SMALL_ROOMS[:1]
 PRESET_NAMES = tuple(variant.name for variant in PRESET_VARIANTS)
+# Maps that are drawn; of an ablation's one sees nothing.
+DRAWN_METHODS = (*PRESET_NAMES, *PEERS, *(variant.name for variant in CURVE_VARIANTS))
 
 
 @dataclass(frozen=True, kw_only=True)

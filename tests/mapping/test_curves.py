@@ -126,11 +126,7 @@ def test_a_camera_in_one_place_finds_no_depth():
 
 def test_speeds_that_hold_the_rotation_are_not_asked(sight):
     pieces, frames = sight
-    wrong = dataclasses.replace(
-        pieces,
-        normal_speed_px_per_ms=np.full(len(pieces), 10.0),
-        event_offsets=pieces.event_offsets,
-    )
+    wrong = dataclasses.replace(pieces, normal_speed_px_per_ms=np.full(len(pieces), 10.0))
     raw = dataclasses.replace(CONFIG, frames=FramesConfig(compensate_rotation=False))
     for config, count in ((CONFIG, 0), (raw, 1)):
         found = curves.with_curves(
