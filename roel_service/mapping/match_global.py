@@ -99,7 +99,7 @@ def match_fixed_lines(
         config: as of `reassociate`.
     """
     settings = config.match_global
-    velocity = _velocities(frames, trajectory) if config.frames.compensate_rotation else None
+    velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
     distance_px = settings.max_distances_px[0]
     pairs = _along(lines, spans, observations, frames, velocity, distance_px, settings)
     stay = replace(config.refine, iteration_count=0)
