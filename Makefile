@@ -9,7 +9,7 @@ BASELINE := proto/baseline.binpb
 WEIGHTS := .venv/.weights
 LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current baseline no-large-files format proto docs bench accuracy limap serve
+.PHONY: demo learned test check stubs-are-current baseline no-large-files format proto docs bench crash accuracy limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -37,6 +37,9 @@ proto: $(INSTALLED)  ## write the committed stubs of proto/, and the client made
 
 bench: $(INSTALLED)  ## measure the maps; SUITE=full takes hours, needs ROEL_DATA and `make limap`
 	$(BIN)/roel bench mapping --suite $(or $(SUITE),quick) --out $(or $(OUT),bench-out)
+
+crash: $(INSTALLED)  ## kill a server 210 times while clients work, and look for what it did not keep
+	cd bench && $(CURDIR)/$(BIN)/python -m roel_crash --kills $(or $(KILLS),210)
 
 accuracy: $(INSTALLED)  ## write docs/accuracy.md anew from bench/results/mapping.json
 	$(BIN)/python -m roel_bench.report

@@ -87,7 +87,9 @@ def plan(kill_count: int, rng: random.Random) -> Iterator[Kill]:
             yield Kill(name="child", failpoint="", strike=_child_after(life_s))
 
 
-def crash(folder: Path, kill_count: int, seed: int, log: IO[bytes]) -> Outcome:
+def crash(
+    folder: Path, kill_count: int, seed: int, log: IO[bytes], checker_count: int = CHECKER_COUNT
+) -> Outcome:
     """Kill a server so many times; what it did not keep.
 
     Args:
@@ -98,7 +100,7 @@ def crash(folder: Path, kill_count: int, seed: int, log: IO[bytes]) -> Outcome:
     outcome, ledger, rng = Outcome(seed=seed), Ledger(), random.Random(seed)
     victim = Victim(folder, 0, log)
     port = victim.port
-    checkers = [Checker(f"127.0.0.1:{port}", ledger, seed + k) for k in range(CHECKER_COUNT)]
+    checkers = [Checker(f"127.0.0.1:{port}", ledger, seed + k) for k in range(checker_count)]
     for checker in checkers:
         checker.start()
     kills = list(plan(kill_count, rng))

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def test_killed_servers_and_children_break_no_promise(tmp_path):
     with (tmp_path / "log").open("ab") as log:
-        outcome = crash(tmp_path / "data", kill_count=3, seed=0, log=log)
+        outcome = crash(tmp_path / "data", kill_count=3, seed=0, log=log, checker_count=1)
     assert outcome.kills.total() == 3
     assert outcome.broken == []
 

@@ -78,13 +78,16 @@ class TestContract:
         assert "ZeroDivisionError" not in str(caught.value)
 
     def test_the_same_bug_has_the_same_fingerprint_and_another_one_has_not(self, make):
-        def fingerprint(name, parameters):
-            with pytest.raises(FaultError) as caught:
-                heard(make, name, parameters)
-            return caught.value.fingerprint
+        async def scenario(executor):
+            found = []
+            for name, parameters in (("fail", 1), ("fail", 2), ("fail_elsewhere", 1)):
+                with pytest.raises(FaultError) as caught:
+                    await executor.run(spec(name, parameters), ignore)
+                found.append(caught.value.fingerprint)
+            return found
 
-        assert fingerprint("fail", "once") == fingerprint("fail", "twice")
-        assert fingerprint("fail", "once") != fingerprint("fail_elsewhere", "once")
+        first, again, elsewhere = using(make, scenario)
+        assert first == again != elsewhere
 
     def test_an_unknown_entry_point_is_a_fault(self, make):
         with pytest.raises(FaultError):
@@ -139,16 +142,6 @@ class TestChildren:
             heard(make, "die", "SIGSEGV")
         assert caught.value.fingerprint == "SIGSEGV"
 
-    @pytest.mark.parametrize("name", ["fill_memory", "allocate_at_once"])
-    def test_a_child_that_takes_too_much_memory_ends_and_the_next_one_works(self, make, name):
-        async def scenario(executor):
-            with pytest.raises(LimitError, match="at most 300 MiB") as caught:
-                await executor.run(spec(name, 2000, memory_bytes=300 * MIB), ignore)
-            assert caught.value.reason == "TASK_OUT_OF_MEMORY"
-            return await executor.run(spec("double", 2), ignore)
-
-        assert using(make, scenario) == 4
-
     def test_a_child_that_takes_too_long_ends(self, make):
         async def scenario(executor):
             with pytest.raises(LimitError, match="within 0 s") as caught:
@@ -174,6 +167,19 @@ class TestChildren:
         usage = using(make, scenario)
         assert usage.peak_rss_mib > 5
         assert usage.cpu_s > 0
+
+
+@pytest.mark.parametrize(
+    ("make", "name"), [(ProcessExecutor, "allocate_at_once"), (warm, "fill_memory")]
+)
+def test_a_child_that_takes_too_much_memory_ends_and_the_next_one_works(make, name):
+    async def scenario(executor):
+        with pytest.raises(LimitError, match="at most 300 MiB") as caught:
+            await executor.run(spec(name, 2000, memory_bytes=300 * MIB), ignore)
+        assert caught.value.reason == "TASK_OUT_OF_MEMORY"
+        return await executor.run(spec("double", 2), ignore)
+
+    assert using(make, scenario) == 4
 
 
 def test_a_warm_child_keeps_its_process_between_calls():
