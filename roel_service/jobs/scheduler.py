@@ -95,6 +95,7 @@ class Scheduler:
         executor: where tasks run.
         prepare: what the tasks of each method are to do.
         policy: what they may use.
+        on_end: is told of every operation that ended, in a thread.
     """
 
     def __init__(
@@ -104,12 +105,14 @@ class Scheduler:
         executor: Executor,
         prepare: Mapping[OperationMethod, Prepare],
         policy: Policy,
+        on_end: Callable[[OperationRecord], None] = lambda record: None,
     ) -> None:
         self._operations = operations
         self._tasks = tasks
         self._executor = executor
         self._prepare = prepare
         self._policy = policy
+        self._on_end = on_end
         self._owner = uuid.uuid4().hex
         self._attempts: dict[str, tuple[TaskRecord, asyncio.Task[None]]] = {}
         self._loops: list[asyncio.Task[None]] = []
@@ -300,6 +303,7 @@ class Scheduler:
         record = await asyncio.to_thread(change, *arguments)
         if record.state.is_final:
             logger.info("%s %s: %s", record.method.value, record.id, record.state.value)
+            await asyncio.to_thread(self._on_end, record)
         self.changes.announce()
         return record
 

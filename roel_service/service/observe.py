@@ -17,8 +17,9 @@ from roel_service.service.calls import Call
 from roel_service.service.metrics import Counter, Gauge, Histogram, Labels, exposition
 from roel_service.service.rules import rule_of
 from roel_service.store.audit import Audit
-from roel_service.store.records import OperationState
+from roel_service.store.records import OperationMethod, OperationRecord, OperationState
 from roel_service.store.store import Store
+from roel_service.v1 import operations_pb2
 from roel_service.wire.errors import code_of
 
 logger = logging.getLogger(__name__)
@@ -53,6 +54,31 @@ class Metrics:
             help="Bytes of answer messages.",
             label_names=("method",),
         )
+        self.ended = Counter(
+            name="roel_operations_ended_total",
+            help="Long-running operations that ended.",
+            label_names=("method", "state"),
+        )
+        self.attempts = Counter(
+            name="roel_operation_attempts_total",
+            help="How often the work of operations that ended was begun.",
+            label_names=("method",),
+        )
+        self.cpu_seconds = Counter(
+            name="roel_operation_cpu_seconds_total",
+            help="Processor seconds of the children of operations that ended.",
+            label_names=("method",),
+        )
+        self.stage_units = Counter(
+            name="roel_stage_units_total",
+            help="Units of work of stages, by whether an earlier result was found.",
+            label_names=("stage", "cached"),
+        )
+        self.stage_seconds = Histogram(
+            name="roel_stage_seconds",
+            help="Seconds of the stages of builds that succeeded.",
+            label_names=("stage",),
+        )
         self._looked_up = (
             Gauge(
                 name="roel_operations",
@@ -73,6 +99,21 @@ class Metrics:
             ),
         )
 
+    def note_end(self, record: OperationRecord) -> None:
+        """Count an operation that ended."""
+        method = record.method.value
+        metadata = operations_pb2.OperationMetadata.FromString(record.metadata)
+        self.ended.add(method, record.state.value)
+        self.attempts.add(method, amount=metadata.attempt_count)
+        self.cpu_seconds.add(method, amount=metadata.cpu_s)
+        for stage in metadata.stages:
+            self.stage_units.add(stage.name, "yes", amount=stage.cached_count)
+            self.stage_units.add(stage.name, "no", amount=stage.done_count - stage.cached_count)
+        if record.method is OperationMethod.BUILD_MAP and record.state is OperationState.SUCCEEDED:
+            version = self._store.maps.version(record.map_id, record.version)
+            for name, seconds in version.report["seconds"].items():
+                self.stage_seconds.observe(name, value=seconds)
+
     def page(self) -> str:
         """As Prometheus reads it."""
         counted = (
@@ -81,6 +122,11 @@ class Metrics:
             self.seconds,
             self.received_bytes,
             self.sent_bytes,
+            self.ended,
+            self.attempts,
+            self.cpu_seconds,
+            self.stage_units,
+            self.stage_seconds,
         )
         return exposition((*counted, *self._looked_up))
 

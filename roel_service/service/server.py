@@ -100,9 +100,9 @@ async def running(
     credentials = listen.credentials()
     async with AsyncExitStack() as resources:
         store = resources.enter_context(Store(data))
-        scheduler = _scheduler(store, settings)
-        await scheduler.start()
         drain, metrics = Drain(), Metrics(store)
+        scheduler = _scheduler(store, settings, metrics)
+        await scheduler.start()
         server = grpc.aio.server(
             interceptors=[GuardInterceptor(_guards(store, settings, drain, metrics))],
             options=_options(settings),
@@ -130,7 +130,7 @@ async def running(
             await executor.close()
 
 
-def _scheduler(store: Store, settings: Settings) -> Scheduler:
+def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
     build = build_preparation(
         store,
         settings.build_entrypoint,
@@ -152,6 +152,7 @@ def _scheduler(store: Store, settings: Settings) -> Scheduler:
             time_s=settings.task_time_s,
             retry_delay_s=settings.retry_delay_s,
         ),
+        metrics.note_end,
     )
 
 

@@ -92,6 +92,16 @@ def test_unfinished_operations_are_shown_by_state(sample):
     assert sample("roel_process_peak_memory_bytes") > 10_000_000
 
 
+def test_operations_that_ended_are_counted_with_their_stages(server, sample):
+    with Client(server.address) as client:
+        stream = ready_recording(client)
+        client.build_map(client.create_map(new_id()), stream, config_of(QUICK)).wait()
+    assert sample('roel_operations_ended_total{method="BuildMap",state="succeeded"}') >= 1
+    assert sample('roel_operation_attempts_total{method="BuildMap"}') >= 1
+    assert sample('roel_stage_units_total{stage="detect",cached="no"}') >= 1
+    assert sample('roel_stage_seconds_sum{stage="detect"}') >= 0.25
+
+
 def test_probes_answer(get):
     assert get("/livez") == (200, "text/plain; charset=utf-8", "ok\n")
     assert get("/readyz")[0] == 200
