@@ -31,6 +31,9 @@ LIBRARY_THREADS = (
     "OPENCV_FOR_THREADS_NUM",
 )
 
+# A child takes what the front leaves.
+NICENESS = 10
+
 
 def serve(pipe: Connection, preload: str) -> None:
     """Body of a child: run each task that arrives, until nobody can send any more.
@@ -43,6 +46,8 @@ def serve(pipe: Connection, preload: str) -> None:
     # its default action, because a Python handler would wait for native code to return.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _end_with_parent()
+    # The front answers health checks while every core builds.
+    os.nice(NICENESS)
     os.environ.update(dict.fromkeys(LIBRARY_THREADS, "1"))
     memory.volunteer()
     if preload:
