@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -47,9 +48,10 @@ class Exporter:
         Raises:
             InputError: an unknown format.
             StateError: MAP_NOT_ACTIVE.
+            CorruptionError: the stored file is no longer what was built.
             LimitError: QUEUE_FULL, TASK_OUT_OF_MEMORY.
         """
-        stored = self._store.maps.map_path(record)
+        stored = await asyncio.to_thread(self._store.maps.map_path, record)
         if format_number in _STORED:
             yield stored
             return

@@ -85,10 +85,13 @@ class BlobStore:
         """
         path = self.path(sha256)
         data = path.read_bytes() if path.exists() else b""
-        found = hashlib.sha256(data).hexdigest()
-        if found != sha256:
-            raise CorruptionError(f"blob {sha256}", "bytes of that digest", found)
+        _check_digest(sha256, hashlib.sha256(data).hexdigest())
         return data
+
+    def checked_path(self, sha256: str) -> Path:
+        """Where a blob lies that is what its name says; raises as `read`."""
+        _check_digest(sha256, self.found_digest(sha256) or "no file")
+        return self.path(sha256)
 
     def stored(self) -> Iterator[StoredBlob]:
         """All blobs, whoever names them."""
@@ -127,6 +130,11 @@ class BlobStore:
             with contextlib.suppress(FileNotFoundError):
                 if path.stat().st_mtime < unused_since_s:
                     path.unlink()
+
+
+def _check_digest(sha256: str, found: str) -> None:
+    if found != sha256:
+        raise CorruptionError(f"blob {sha256}", "bytes of that digest", found)
 
 
 def _renewed(path: Path) -> bool:

@@ -258,7 +258,7 @@ class Maps:
     def map_path(self, record: MapVersionRecord) -> Path:
         """Where the map file of a usable version lies; raises as `map_file`."""
         check_state(record, USABLE)
-        return self._blobs.path(record.sha256)
+        return self._blobs.checked_path(record.sha256)
 
     def imported_path(self, record: MapVersionRecord) -> Path:
         """Where the file lies that a version is being made from."""
