@@ -5,6 +5,7 @@ import threading
 import pytest
 
 from roel_service.errors import EventsError, LimitError, UnavailableError
+from roel_service.jobs import warm as warming
 from roel_service.jobs.executors import InlineExecutor, ProcessExecutor
 from roel_service.jobs.faults import FaultError
 from roel_service.jobs.task import Limits, Partial, TaskSpec, Usage
@@ -188,6 +189,16 @@ def test_a_warm_child_keeps_its_process_between_calls():
         return {(await call)[0] for call in calls}
 
     assert len(using(warm, scenario)) == 1
+
+
+def test_a_warm_child_is_replaced_before_it_grows_old(monkeypatch):
+    monkeypatch.setattr(warming, "MAX_CALL_COUNT", 1)
+
+    async def scenario(executor):
+        calls = [executor.run(spec("tell_environment", "HOME"), ignore) for _ in range(2)]
+        return {(await call)[0] for call in calls}
+
+    assert len(using(warm, scenario)) == 2
 
 
 def test_calls_beyond_children_and_queue_are_refused():
