@@ -122,6 +122,7 @@ _ROWS = (
         "a resource in another state than the request needs, for no reason listed below",
     ),
     Reason("STREAM_FINALIZED", StateError, "an upload to a recording that is frozen"),
+    Reason("STREAM_NOT_EMPTY", StateError, "an import into a recording that has events"),
     Reason("STREAM_NOT_FINALIZED", StateError, "a build from a recording that is still open"),
     Reason("NO_POSES", StateError, "a build from a recording without poses"),
     Reason("SEQUENCE_GAP", StateError, "a chunk or part that is not the next one"),

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from roel_service.config.stages import Config
+from roel_service.jobs.event_imports import EventImportParameters
 from roel_service.jobs.imports import ImportParameters
 from roel_service.jobs.inputs import (
     CachePlace,
@@ -48,6 +49,25 @@ def import_preparation(store: Store) -> Prepare:
         file = store.maps.imported_path(version)
         parameters = ImportParameters(file=file, sha256=version.imported_file["sha256"])
         return Prepared("roel_service.jobs.imports:run_import", parameters)
+
+    return prepare
+
+
+def event_import_preparation(store: Store, max_size_bytes: int) -> Prepare:
+    """How an import of events is prepared: its task names the blob and the recording's fence."""
+
+    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, EventImportParameters]:
+        camera = store.event_streams.get(operation.event_stream_id).camera
+        parameters = EventImportParameters(
+            file=store.event_imports.blob_path(task.inputs[0]),
+            width=camera.width,
+            height=camera.height,
+            # Attempts may overlap when a lease was lost; each has a file of its own.
+            target=store.scratch_file(f"{task.id}-{task.attempt_count}.rec"),
+            max_size_bytes=max_size_bytes,
+            fence=int(task.parameters),
+        )
+        return "roel_service.jobs.event_imports:run_event_import", parameters
 
     return prepare
 

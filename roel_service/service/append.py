@@ -73,6 +73,7 @@ def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:
         t1_us=summary.t1_us,
         event_count=summary.event_count,
         longest_step_us=summary.longest_step_us,
+        length=len(message.data),
         data=message.data,
         sha256=hashlib.sha256(message.data).hexdigest(),
     )

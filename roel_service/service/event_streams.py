@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from functools import partial
 from itertools import islice
 from typing import Any
 
+from google.longrunning import operations_pb2
 from google.protobuf.empty_pb2 import Empty
 
 from roel_service.errors import InputError, LimitError, TrajectoryError
+from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.append import EventSink
+from roel_service.service.operations import submitted
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
-from roel_service.service.requests import request_id
+from roel_service.service.requests import content_sha256, request_id
 from roel_service.service.settings import Settings
 from roel_service.service.uploads import OpenUploads, Upload, next_request, request_part
-from roel_service.store.event_streams import EventStreams, PosePart
+from roel_service.store.event_streams import PosePart
 from roel_service.store.records import EventStreamRecord
+from roel_service.store.store import Store
 from roel_service.v1 import events_pb2, types_pb2
 from roel_service.wire import names
 from roel_service.wire.chunks import decode_chunk
@@ -36,8 +41,12 @@ MAX_PREVIEW_CHUNK_COUNT = 256
 class EventStreamServicer:
     """Decodes requests, calls the store in a thread, encodes answers."""
 
-    def __init__(self, streams: EventStreams, uploads: OpenUploads, settings: Settings) -> None:
-        self._streams = streams
+    def __init__(
+        self, store: Store, scheduler: Scheduler, uploads: OpenUploads, settings: Settings
+    ) -> None:
+        self._store = store
+        self._scheduler = scheduler
+        self._streams = store.event_streams
         self._uploads = uploads
         self._settings = settings
         self._drawing = asyncio.Lock()
@@ -104,6 +113,19 @@ class EventStreamServicer:
         # One at a time: the front has other things to do.
         async with self._drawing:
             return await asyncio.to_thread(self._preview, record, request.start_us, request.stop_us)
+
+    async def ImportEventStream(
+        self, request: events_pb2.ImportEventStreamRequest, context: Any
+    ) -> operations_pb2.Operation:
+        identity = request_id(request)
+        begin = partial(
+            self._store.event_imports.begin,
+            names.event_stream_id(request.name),
+            names.checked_sha256(request.blob.sha256),
+            content_sha256(request),
+            identity,
+        )
+        return await submitted(self._store, self._scheduler, begin, identity)
 
     async def FinalizeEventStream(
         self, request: events_pb2.FinalizeEventStreamRequest, context: Any

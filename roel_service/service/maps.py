@@ -12,18 +12,17 @@ from google.longrunning import operations_pb2
 from roel_service.config.stages import Config
 from roel_service.errors import ConfigError, InputError
 from roel_service.jobs.preparation import build_parameters_to_bytes
-from roel_service.jobs.scheduler import Begin, Scheduler
+from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.exports import Exporter
 from roel_service.service.labels import checked_display_name, checked_labels, updated_fields
 from roel_service.service.line_streams import conditions_from_proto, line_messages
-from roel_service.service.operations import encoded_operation
+from roel_service.service.operations import submitted
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import map_to_proto, map_version_to_proto
 from roel_service.service.requests import content_sha256, request_id
 from roel_service.service.settings import Settings
 from roel_service.store.builds import ImportedBlob
 from roel_service.store.records import MapVersionRecord
-from roel_service.store.requests import RequestId
 from roel_service.store.store import Store
 from roel_service.v1 import maps_pb2
 from roel_service.wire import names
@@ -114,7 +113,7 @@ class MapServicer:
             request=identity,
             follow=request.follow,
         )
-        return await self._submitted(begin, identity)
+        return await submitted(self._store, self._scheduler, begin, identity)
 
     async def ImportMap(
         self, request: maps_pb2.ImportMapRequest, context: Any
@@ -125,7 +124,7 @@ class MapServicer:
         begin = partial(
             self._store.builds.begin_import, map_id, file, content_sha256(request), identity
         )
-        return await self._submitted(begin, identity)
+        return await submitted(self._store, self._scheduler, begin, identity)
 
     async def GetMapVersion(
         self, request: maps_pb2.GetMapVersionRequest, context: Any
@@ -208,16 +207,6 @@ class MapServicer:
             blocks=_fitting(blocks, missing, self._settings.message_out_bytes // 2),
             tail=blocks.tail,
         )
-
-    async def _submitted(
-        self, begin: Begin, identity: RequestId | None
-    ) -> operations_pb2.Operation:
-        """The operation that was begun, now or by an earlier call with the same request id."""
-        # A full queue does not keep anybody from asking again.
-        record = await asyncio.to_thread(self._store.operations.begun, identity)
-        if record is None:
-            record = await self._scheduler.submit(begin)
-        return await encoded_operation(self._store, record)
 
     async def _imported(self, request: maps_pb2.ImportMapRequest) -> ImportedBlob:
         """The file of an import, in the store."""

@@ -11,7 +11,7 @@ from google.longrunning import operations_pb2
 from google.protobuf.empty_pb2 import Empty
 
 from roel_service.errors import NotFoundError
-from roel_service.jobs.scheduler import Scheduler
+from roel_service.jobs.scheduler import Begin, Scheduler
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import (
     event_stream_to_proto,
@@ -19,6 +19,7 @@ from roel_service.service.records import (
     operation_to_proto,
 )
 from roel_service.store.records import OperationMethod, OperationRecord, OperationState
+from roel_service.store.requests import RequestId
 from roel_service.store.store import Store
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.wire import names
@@ -103,6 +104,17 @@ class OperationServicer:
 
     async def _encoded(self, record: OperationRecord) -> operations_pb2.Operation:
         return await encoded_operation(self._store, record)
+
+
+async def submitted(
+    store: Store, scheduler: Scheduler, begin: Begin, identity: RequestId | None
+) -> operations_pb2.Operation:
+    """The operation that was begun, now or by an earlier call with the same request id."""
+    # A full queue does not keep anybody from asking again.
+    record = await asyncio.to_thread(store.operations.begun, identity)
+    if record is None:
+        record = await scheduler.submit(begin)
+    return await encoded_operation(store, record)
 
 
 async def encoded_operation(store: Store, record: OperationRecord) -> operations_pb2.Operation:

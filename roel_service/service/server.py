@@ -17,7 +17,11 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from roel_service.jobs.executors import ProcessExecutor
-from roel_service.jobs.preparation import build_preparation, import_preparation
+from roel_service.jobs.preparation import (
+    build_preparation,
+    event_import_preparation,
+    import_preparation,
+)
 from roel_service.jobs.scheduler import Policy, Scheduler
 from roel_service.jobs.upkeep import upkeep
 from roel_service.jobs.warm import WarmExecutor
@@ -144,6 +148,9 @@ def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
         {
             OperationMethod.BUILD_MAP: build,
             OperationMethod.IMPORT_MAP: import_preparation(store),
+            OperationMethod.IMPORT_EVENT_STREAM: event_import_preparation(
+                store, settings.event_stream_bytes
+            ),
         },
         Policy(
             unfinished_count=settings.concurrent_builds + settings.queued_builds,

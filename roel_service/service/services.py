@@ -76,7 +76,7 @@ def add_services(
     operations = OperationServicer(store, scheduler)
     uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
-        "EventStreamService": EventStreamServicer(store.event_streams, uploads, settings),
+        "EventStreamService": EventStreamServicer(store, scheduler, uploads, settings),
         "BlobService": BlobServicer(store.uploads, uploads, settings),
         "MapService": MapServicer(store, scheduler, exporter, settings),
         "OperationService": operations,

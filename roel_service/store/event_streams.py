@@ -48,12 +48,13 @@ _MEMORY = row_memory(event_stream_from_row)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Chunk:
-    """Events as they are stored; `data` has been checked once and found sound.
+class ChunkFacts:
+    """What a row tells of a chunk, which was checked once and found sound.
 
     Attributes:
         longest_step_us: longest time between two neighbouring events of the chunk.
-        sha256: of `data`, hexadecimal.
+        length: its bytes.
+        sha256: of its bytes, hexadecimal.
     """
 
     seq: int
@@ -61,8 +62,15 @@ class Chunk:
     t1_us: int
     event_count: int
     longest_step_us: int
-    data: bytes
+    length: int
     sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chunk(ChunkFacts):
+    """A chunk with its bytes."""
+
+    data: bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +97,7 @@ class EventStreams:
         self._recordings = recordings
         # Whoever changes the chunks of a recording holds its lock, so that the slow part, making a
         # file durable, needs no transaction.
-        self._locks = KeyedLocks()
+        self.locks = KeyedLocks()
 
     def create(
         self, stream_id: str, camera: Camera, request: RequestId | None = None
@@ -144,7 +152,7 @@ class EventStreams:
         Raises:
             StateError: STREAM_FINALIZED.
         """
-        with self._locks.holding(stream_id), self._database.write() as connection:
+        with self.locks.holding(stream_id), self._database.write() as connection:
             record = _get_open(connection, stream_id)
             return _update(connection, record, fence=record.fence + 1)
 
@@ -163,7 +171,7 @@ class EventStreams:
             EventsError: a chunk that begins before the end of the one before it.
             LimitError: EVENT_STREAM_TOO_LARGE.
         """
-        with self._locks.holding(stream_id):
+        with self.locks.holding(stream_id):
             with self._database.read() as connection:
                 record = _get_writable(connection, stream_id, fence)
                 fresh = [chunk for chunk in chunks if not _is_repeat(connection, record, chunk)]
@@ -220,7 +228,7 @@ class EventStreams:
             EventsError: NO_EVENTS.
             ConflictError: ETAG_MISMATCH.
         """
-        with self._locks.holding(stream_id):
+        with self.locks.holding(stream_id):
             with self._database.read() as connection:
                 known = recall(connection, request, _MEMORY)
                 record = known or _get(connection, stream_id)
@@ -257,7 +265,7 @@ class EventStreams:
             connection.execute(delete(EVENT_STREAM).where(EVENT_STREAM.c.uid == record.uid))
             return record
 
-        with self._locks.holding(stream_id), self._database.write() as connection:
+        with self.locks.holding(stream_id), self._database.write() as connection:
             deleted = once(connection, request, _MEMORY, partial(act, connection))
         self._recordings.delete(deleted.uid)
 
@@ -314,6 +322,33 @@ class EventStreams:
         self._recordings.sweep(committed_bytes)
 
 
+def begin_filling(connection: Connection, stream_id: str) -> EventStreamRecord:
+    """Become the one writer of a recording without events.
+
+    Raises:
+        StateError: STREAM_FINALIZED, STREAM_NOT_EMPTY.
+    """
+    record = _get_empty(connection, stream_id)
+    return _update(connection, record, fence=record.fence + 1)
+
+
+def adopt_chunks(
+    connection: Connection, stream_id: str, fence: int, chunks: Sequence[ChunkFacts]
+) -> EventStreamRecord:
+    """All chunks of a recording at once; the caller puts the file in place.
+
+    Raises:
+        StateError: STREAM_FINALIZED, STREAM_NOT_EMPTY.
+        ConflictError: WRITER_REPLACED.
+    """
+    record = _get_empty(connection, stream_id)
+    if record.fence != fence:
+        raise writer_replaced(stream_id)
+    _check_order(record, chunks)
+    connection.execute(insert(EVENT_CHUNK), _chunk_rows(record, chunks))
+    return _update(connection, record, **_grown(record, chunks))
+
+
 def get_finalized(connection: Connection, stream_id: str) -> EventStreamRecord:
     """A recording that can be mapped; raises `StateError` STREAM_NOT_FINALIZED."""
     record = _get(connection, stream_id)
@@ -353,6 +388,15 @@ def _get_open(connection: Connection, stream_id: str) -> EventStreamRecord:
     return record
 
 
+def _get_empty(connection: Connection, stream_id: str) -> EventStreamRecord:
+    record = _get_open(connection, stream_id)
+    if record.chunk_count:
+        found = f"{record.chunk_count} chunks"
+        reason = "STREAM_NOT_EMPTY"
+        raise StateError(stream_id, "a recording without events", found, reason=reason)
+    return record
+
+
 def _get_writable(connection: Connection, stream_id: str, fence: int) -> EventStreamRecord:
     record = _get_open(connection, stream_id)
     if record.fence != fence:
@@ -384,7 +428,7 @@ def _is_repeat(connection: Connection, record: EventStreamRecord, chunk: Chunk) 
     return True
 
 
-def _check_order(record: EventStreamRecord, chunks: Sequence[Chunk]) -> None:
+def _check_order(record: EventStreamRecord, chunks: Sequence[ChunkFacts]) -> None:
     end_us = record.end_us if record.chunk_count else chunks[0].t0_us
     for seq, chunk in enumerate(chunks, start=record.chunk_count):
         if chunk.seq != seq:
@@ -396,7 +440,7 @@ def _check_order(record: EventStreamRecord, chunks: Sequence[Chunk]) -> None:
         end_us = chunk.t1_us
 
 
-def _chunk_rows(record: EventStreamRecord, chunks: Sequence[Chunk]) -> list[dict[str, Any]]:
+def _chunk_rows(record: EventStreamRecord, chunks: Sequence[ChunkFacts]) -> list[dict[str, Any]]:
     rows = []
     offset = record.size_bytes
     for chunk in chunks:
@@ -407,11 +451,11 @@ def _chunk_rows(record: EventStreamRecord, chunks: Sequence[Chunk]) -> list[dict
             "t1_us": chunk.t1_us,
             "event_count": chunk.event_count,
             "offset": offset,
-            "length": len(chunk.data),
+            "length": chunk.length,
             "sha256": chunk.sha256,
         }
         rows.append(row)
-        offset += len(chunk.data)
+        offset += chunk.length
     return rows
 
 
@@ -423,7 +467,7 @@ def _check_size(last_row: dict[str, Any], max_size_bytes: int) -> None:
         raise LimitError("event stream", expected, f"{size_bytes}", reason=reason)
 
 
-def _grown(record: EventStreamRecord, chunks: Sequence[Chunk]) -> dict[str, int]:
+def _grown(record: EventStreamRecord, chunks: Sequence[ChunkFacts]) -> dict[str, int]:
     """What changes in a record when chunks are appended."""
     ends_us = [record.end_us if record.chunk_count else chunks[0].t0_us]
     ends_us += [chunk.t1_us for chunk in chunks]
@@ -432,7 +476,7 @@ def _grown(record: EventStreamRecord, chunks: Sequence[Chunk]) -> dict[str, int]
     return {
         "chunk_count": record.chunk_count + len(chunks),
         "event_count": record.event_count + sum(chunk.event_count for chunk in chunks),
-        "size_bytes": record.size_bytes + sum(len(chunk.data) for chunk in chunks),
+        "size_bytes": record.size_bytes + sum(chunk.length for chunk in chunks),
         "start_us": record.start_us if record.chunk_count else chunks[0].t0_us,
         "end_us": chunks[-1].t1_us,
         "longest_gap_us": max(record.longest_gap_us, *steps_us, *pauses_us),

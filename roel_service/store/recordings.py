@@ -38,6 +38,11 @@ class Recordings:
             os.fsync(file.fileno())
             failpoint("recording.synced")
 
+    def replace(self, uid: str, source: Path) -> None:
+        """Let a durable file of the same file system be the append file."""
+        source.replace(self.path(uid))
+        sync_folder(self._folder)
+
     def cut(self, uid: str, committed_bytes: int) -> Path:
         """Drop what was never committed; the file that holds the rest."""
         os.truncate(self.path(uid), committed_bytes)

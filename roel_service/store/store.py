@@ -17,6 +17,7 @@ from roel_service.store.audit import Audit
 from roel_service.store.blobs import BlobStore
 from roel_service.store.builds import Builds, VersionCompletion
 from roel_service.store.database import Database
+from roel_service.store.event_imports import EventImportCompletion, EventImports
 from roel_service.store.event_streams import EventStreams
 from roel_service.store.files import make_folder
 from roel_service.store.garbage import LONGEST_UPLOAD_S, Swept, sweep_blobs
@@ -44,7 +45,7 @@ class Store:
 
     Attributes:
         folder: where it is.
-        event_streams, uploads, maps, builds, operations, tasks: the repositories.
+        event_streams, event_imports, uploads, maps, builds, operations, tasks: the repositories.
         principals, audit: who may call, and who changed what.
 
     Raises:
@@ -63,6 +64,7 @@ class Store:
             self._blobs = BlobStore(folder / BLOBS)
             self._recordings = Recordings(folder / RECORDINGS)
             self.event_streams = EventStreams(self._database, self._blobs, self._recordings)
+            self.event_imports = EventImports(self._database, self._blobs, self.event_streams)
             self.maps = Maps(self._database, self._blobs)
             self.builds = Builds(self._database, self._blobs)
             self.principals = Principals(self._database)
@@ -70,7 +72,11 @@ class Store:
             versions = VersionCompletion(self._blobs)
             self.operations = Operations(
                 self._database,
-                {OperationMethod.BUILD_MAP: versions, OperationMethod.IMPORT_MAP: versions},
+                {
+                    OperationMethod.BUILD_MAP: versions,
+                    OperationMethod.IMPORT_MAP: versions,
+                    OperationMethod.IMPORT_EVENT_STREAM: EventImportCompletion(self._recordings),
+                },
             )
             self.tasks = Tasks(self._database)
             self.uploads = Uploads(self._database, self._blobs, folder / "uploads")
@@ -106,6 +112,10 @@ class Store:
         if not os.access(self.folder, os.W_OK | os.X_OK):
             problems.append("the data folder cannot be written")
         return problems
+
+    def scratch_file(self, name: str) -> Path:
+        """Where work may leave a file of this name; gone at the next start."""
+        return self._scratch / name
 
     @contextmanager
     def scratch(self) -> Iterator[Path]:

@@ -3,6 +3,7 @@
 import grpc
 import warnings
 
+from google.longrunning import operations_pb2 as google_dot_longrunning_dot_operations__pb2
 from google.protobuf import empty_pb2 as google_dot_protobuf_dot_empty__pb2
 from roel_service.v1 import events_pb2 as roel__service_dot_v1_dot_events__pb2
 
@@ -65,6 +66,11 @@ class EventStreamServiceStub:
                 '/roel_service.v1.EventStreamService/PreviewEvents',
                 request_serializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.FromString,
+                _registered_method=True)
+        self.ImportEventStream = channel.unary_unary(
+                '/roel_service.v1.EventStreamService/ImportEventStream',
+                request_serializer=roel__service_dot_v1_dot_events__pb2.ImportEventStreamRequest.SerializeToString,
+                response_deserializer=google_dot_longrunning_dot_operations__pb2.Operation.FromString,
                 _registered_method=True)
         self.FinalizeEventStream = channel.unary_unary(
                 '/roel_service.v1.EventStreamService/FinalizeEventStream',
@@ -140,6 +146,15 @@ class EventStreamServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ImportEventStream(self, request, context):
+        """Fills a recording without events from an uploaded file: HDF5 with the columns `events/{x,y,t,p}`,
+        NPZ, or text with a line `t x y p` for each event. Answers with the recording, which is still
+        open: poses may follow. Whoever appends meanwhile makes the import fail with WRITER_REPLACED.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def FinalizeEventStream(self, request, context):
         """Freezes a recording; only a frozen one can be mapped. Freezing twice is harmless.
         """
@@ -200,6 +215,11 @@ def add_EventStreamServiceServicer_to_server(servicer, server):
                     servicer.PreviewEvents,
                     request_deserializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.SerializeToString,
+            ),
+            'ImportEventStream': grpc.unary_unary_rpc_method_handler(
+                    servicer.ImportEventStream,
+                    request_deserializer=roel__service_dot_v1_dot_events__pb2.ImportEventStreamRequest.FromString,
+                    response_serializer=google_dot_longrunning_dot_operations__pb2.Operation.SerializeToString,
             ),
             'FinalizeEventStream': grpc.unary_unary_rpc_method_handler(
                     servicer.FinalizeEventStream,
@@ -385,6 +405,33 @@ class EventStreamService:
             '/roel_service.v1.EventStreamService/PreviewEvents',
             roel__service_dot_v1_dot_events__pb2.PreviewEventsRequest.SerializeToString,
             roel__service_dot_v1_dot_events__pb2.PreviewEventsResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ImportEventStream(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.EventStreamService/ImportEventStream',
+            roel__service_dot_v1_dot_events__pb2.ImportEventStreamRequest.SerializeToString,
+            google_dot_longrunning_dot_operations__pb2.Operation.FromString,
             options,
             channel_credentials,
             insecure,

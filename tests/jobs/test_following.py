@@ -71,6 +71,7 @@ def append_events(store, events, pause_s=0.0):
             t1_us=int(piece.t_us[-1]),
             event_count=len(piece),
             longest_step_us=0,
+            length=len(data),
             data=data,
             sha256=hashlib.sha256(data).hexdigest(),
         )

@@ -5,6 +5,7 @@ from contextlib import ExitStack
 import cv2
 import numpy as np
 import pytest
+from google.longrunning import operations_pb2, operations_pb2_grpc
 
 from roel_service.errors import (
     CameraError,
@@ -397,3 +398,26 @@ def test_the_same_request_id_opens_and_deletes_once(connection):
     )
     for _ in range(2):
         connection.call(stub.DeleteEventStream, delete)
+
+
+def test_a_file_is_imported(client, call, connection, stream, tmp_path):
+    file = tmp_path / "events.txt"
+    file.write_text("0.001 3 4 1\n0.002 5 6 0\n0.002 7 8 1\n")
+    request = events_pb2.ImportEventStreamRequest(
+        name=stream, blob=client.upload_blob(file), request_id=str(uuid.uuid4())
+    )
+    begun = call("ImportEventStream", request)
+    assert call("ImportEventStream", request).name == begun.name
+    operations = operations_pb2_grpc.OperationsStub(connection.channel)
+    wait = operations_pb2.WaitOperationRequest(name=begun.name)
+    done = connection.call(operations.WaitOperation, wait, timeout_s=60)
+    record = events_pb2.EventStream()
+    assert done.response.Unpack(record)
+    assert (record.name, record.event_count, record.state) == (stream, 3, OPEN)
+    (events,) = client.read_events(stream)
+    assert events.t_us.tolist() == [1000, 2000, 2000]
+    assert events.x.tolist() == [3, 5, 7]
+    request.request_id = str(uuid.uuid4())
+    with pytest.raises(StateError) as caught:
+        call("ImportEventStream", request)
+    assert caught.value.reason == "STREAM_NOT_EMPTY"

@@ -16,6 +16,7 @@ def chunk(seq, data=b"events", t0_us=None, t1_us=None, event_count=3, longest_st
         event_count=event_count,
         longest_step_us=longest_step_us,
         data=data,
+        length=len(data),
         sha256=hashlib.sha256(data).hexdigest(),
     )
 
