@@ -56,7 +56,7 @@ def import_preparation(store: Store) -> Prepare:
 def event_import_preparation(store: Store, max_size_bytes: int) -> Prepare:
     """How an import of events is prepared: its task names the blob and the recording's fence."""
 
-    def prepare(operation: OperationRecord, task: TaskRecord) -> tuple[str, EventImportParameters]:
+    def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
         camera = store.event_streams.get(operation.event_stream_id).camera
         parameters = EventImportParameters(
             file=store.event_imports.blob_path(task.inputs[0]),
@@ -67,7 +67,7 @@ def event_import_preparation(store: Store, max_size_bytes: int) -> Prepare:
             max_size_bytes=max_size_bytes,
             fence=int(task.parameters),
         )
-        return "roel_service.jobs.event_imports:run_event_import", parameters
+        return Prepared("roel_service.jobs.event_imports:run_event_import", parameters)
 
     return prepare
 
