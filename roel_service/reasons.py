@@ -148,6 +148,7 @@ _ROWS = (
     Reason("WRITER_REPLACED", ConflictError, "an upload that another one took over"),
     Reason("LIMIT_EXCEEDED", LimitError, "something too large, for no reason listed below"),
     Reason("RECORDING_TOO_LONG", LimitError, "more poses than are refined at once"),
+    Reason("MESSAGE_TOO_LARGE", LimitError, "a message beyond the limit of either side"),
     Reason("EVENT_STREAM_TOO_LARGE", LimitError, "a recording beyond the server's limit"),
     Reason("CREDIT_EXCEEDED", LimitError, "an upload that does not wait for acknowledgements"),
     Reason(

@@ -29,6 +29,8 @@ HARMLESS_VERBS = (
     "Watch",
     "Export",
     "Sync",
+    "Register",
+    "Localize",
     "Cancel",
     "Finalize",
 )

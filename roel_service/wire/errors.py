@@ -20,6 +20,9 @@ DOMAIN = "roel-service"
 # when every character takes four bytes and the headers' encodings add to that.
 MAX_TEXT_LENGTH = 300
 
+# How gRPC, which checks sizes before anybody sees a message, says that one is too large.
+TOO_LARGE = "message larger than max"
+
 # The first class that an error is an instance of decides; subclasses stand before their bases.
 CODES: tuple[tuple[type[RoelError], int], ...] = (
     (errors.InputError, code_pb2.INVALID_ARGUMENT),
@@ -112,6 +115,9 @@ def error_from_status(
 
 def _restored(status: status_pb2.Status, subject: str) -> RoelError:
     info = _error_info(status)
+    if info is None and TOO_LARGE in status.message:
+        expected, found = "messages that the other side takes", status.message
+        return errors.LimitError(subject, expected, found, reason="MESSAGE_TOO_LARGE")
     if info is None:
         kind = FALLBACK.get(status.code, RoelError)
         return kind(subject, "an answer", f"{code_pb2.Code.Name(status.code)}: {status.message}")

@@ -9,7 +9,7 @@ import pytest
 
 from roel_client import Client
 from roel_client.connection import Connection, Endpoint
-from roel_service.errors import NotFoundError
+from roel_service.errors import LimitError, NotFoundError
 from roel_service.v1 import maps_pb2, maps_pb2_grpc
 
 from .processes import Server, config_of, new_id, ready_recording
@@ -139,6 +139,12 @@ def test_a_message_that_grpc_would_inflate_is_refused(server):
         with pytest.raises(grpc.RpcError) as caught:
             stub.GetMap(maps_pb2.GetMapRequest(name="x" * 10_000), timeout=10)
     assert caught.value.code() is grpc.StatusCode.UNIMPLEMENTED
+
+
+def test_a_message_beyond_the_limit_is_refused(server):
+    with Client(server.address) as client, pytest.raises(LimitError) as caught:
+        client.map_version("x" * 5_000_000)
+    assert caught.value.reason == "MESSAGE_TOO_LARGE"
 
 
 def test_calls_that_are_given_up_do_no_harm(server):
