@@ -44,10 +44,12 @@ def sum_of_planes(planes: Array, byte_count: int) -> int:
 
 def largest_of_planes(planes: Array, byte_count: int) -> int:
     """Largest of the integers behind byte planes, found from the highest byte down."""
-    largest = 0
-    candidates: Array = np.ones(len(planes) // byte_count, np.uint8)
-    for plane in planes.reshape(byte_count, -1)[::-1]:
-        top = int((plane * candidates).max())
-        candidates &= plane == top
+    *lower, highest = planes.reshape(byte_count, -1)
+    largest = int(highest.max())
+    candidates = highest == largest
+    for plane in reversed(lower):
+        kept = plane * candidates
+        top = int(kept.max())
+        candidates &= kept == top
         largest = largest << 8 | top
     return largest
