@@ -201,6 +201,14 @@ def test_a_warm_child_is_replaced_before_it_grows_old(monkeypatch):
     assert len(using(warm, scenario)) == 2
 
 
+def test_the_first_call_starts_a_child_that_nobody_started_before():
+    async def scenario(executor):
+        calls = [executor.run(spec("tell_environment", "HOME"), ignore) for _ in range(2)]
+        return {(await call)[0] for call in calls}
+
+    assert len(using(lambda capacity: WarmExecutor(capacity, queued_count=8), scenario)) == 1
+
+
 def test_calls_beyond_children_and_queue_are_refused():
     async def scenario(executor):
         executor = WarmExecutor(1, queued_count=0)
