@@ -47,13 +47,14 @@ class Guess:
 def guesses_near(
     source: Source, target: PreparedCloud, T_init: SE3, config: RegisterConfig
 ) -> list[Guess]:
-    """Guesses within reach of a first one, best first."""
+    """Guesses within reach of a first one, best first, and that one itself."""
     known = matching_rotations(source.axes, target.axes)
     turns = rotation_angle(known @ T_init.rotation.T) if len(known) else np.empty(0)
     rotations = known[turns <= np.radians(config.reach_deg)]
     if len(rotations) == 0:
         rotations = np.concatenate([T_init.rotation[None], _turned(T_init.rotation)])
-    return _voted(source, target, rotations, config, T_init)
+    first = Guess(T_target_source=T_init, scale=1.0, votes=0.0)
+    return [*_voted(source, target, rotations, config, T_init), first]
 
 
 def guesses_anywhere(source: Source, target: PreparedCloud, config: RegisterConfig) -> list[Guess]:
@@ -64,7 +65,8 @@ def guesses_anywhere(source: Source, target: PreparedCloud, config: RegisterConf
     if len(rotations) == 0:
         angles = np.arange(BLIND_HEADING_COUNT) * (2.0 * np.pi / BLIND_HEADING_COUNT)
         rotations = rotation_from_vector(angles[:, None] * [0.0, 0.0, 1.0])
-    return _voted(source, target, rotations, config, None)
+    found = _voted(source, target, rotations, config, None)
+    return found or [Guess(T_target_source=SE3.identity(), scale=1.0, votes=0.0)]
 
 
 def _turned(rotation: FloatArray) -> FloatArray:

@@ -133,6 +133,8 @@ def normals_of(
     points: FloatArray, patches: Patches, tree: cKDTree, cell_m: float, tolerance_m: float
 ) -> tuple[FloatArray, BoolArray]:
     """(N, 3) normals of the patches that hold the points, and (N,) whether one does."""
+    if len(patches.centres) == 0:
+        return np.zeros_like(points), np.zeros(len(points), np.bool_)
     distance, near = tree.query(
         points, k=CANDIDATE_COUNT, distance_upper_bound=REACH_CELLS * cell_m, workers=-1
     )
@@ -148,6 +150,8 @@ def normals_of(
 def find_creases(patches: Patches, tree: cKDTree, points: cKDTree, cell_m: float) -> Creases:
     """Where planes of patches near one another meet, with points of the cloud there."""
     pairs = tree.query_pairs(REACH_CELLS * cell_m, output_type="ndarray")
+    if len(pairs) == 0:
+        return _merged(np.empty((0, 3)), np.empty((0, 3)), cell_m)
     n1, n2 = patches.normals[pairs].transpose(1, 0, 2)
     direction = np.cross(n1, n2)
     sine = norm(direction)

@@ -129,6 +129,28 @@ def found(prepared):
     return register_map(room_map(), prepared, CONFIG, T_init=NUDGE).T_target_source
 
 
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.random.default_rng(0).normal(size=(150, 3)),
+        np.linspace(0.0, 3.0, 200)[:, None] * [1.0, 0.5, 0.2],
+        np.zeros((120, 3))
+        + [1.0, 2.0, 1.0]
+        + 1e-2 * np.random.default_rng(1).normal(size=(120, 3)),
+    ],
+    ids=["scattered", "one line", "one place"],
+)
+@pytest.mark.parametrize("method", ["auto", "global", "plane", "line"])
+def test_clouds_without_surfaces_are_no_place_to_rely_on(points, method):
+    segments = room_map().segments
+    if np.ptp(points) < 0.2:
+        segments = 0.02 * segments
+    result = register_map(
+        LineMap.from_segments(segments), PointCloud(points=points), CONFIG, method=method
+    )
+    assert result.verdict is not Verdict.ACCEPTED
+
+
 class TestProperties:
     """What must hold whatever the numbers are."""
 
