@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from roel_service.io.events import EventFile
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
+    from roel_service.scene.clouds import PointCloud
     from roel_service.scene.lines import LineMap
     from roel_service.scene.results import RegistrationResult
     from roel_service.scene.trajectory import Trajectory
@@ -241,13 +242,12 @@ def register_map(
     """Register a map with a cloud; the keys of `roel register`."""
     from roel_service.evaluation.registration_figures import draw_registration
     from roel_service.geometry.se3 import SE3
-    from roel_service.io.clouds import read_cloud
     from roel_service.io.transforms import read_transform
     from roel_service.register import register
 
     T_init = SE3.identity() if init is None else read_transform(Path(init))
     line_map = _read_map(name)
-    cloud = read_cloud(Path(cloud_name))
+    cloud = _read_target(cloud_name)
     started_s = time.perf_counter()
     with naming({"map": name, "cloud": cloud_name}):
         result = register.register_map(line_map, cloud, config, method=method, T_init=T_init)
@@ -255,6 +255,16 @@ def register_map(
     if plot is not None:
         draw_registration(line_map, cloud, T_init, result, plot)
     return _registration_document(result, seconds)
+
+
+def _read_target(name: str) -> PointCloud | LineMap:
+    """What a map is registered with: a `.rlm` file, or a cloud of any format."""
+    from roel_service.io.clouds import read_cloud
+    from roel_service.io.files import open_input
+
+    with open_input(Path(name)) as file:
+        is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
+    return read_map_file(name).line_map if is_map_file else read_cloud(Path(name))
 
 
 def _registration_document(result: RegistrationResult, seconds: float) -> dict[str, Any]:

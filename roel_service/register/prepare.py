@@ -9,10 +9,13 @@ from scipy.spatial import cKDTree
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
+from roel_service.geometry.segments import sample_segments
+from roel_service.geometry.vectors import unit
 from roel_service.register.directions import dominant_directions
 from roel_service.register.surfaces import Creases, find_creases, fit_patches, normals_of
 from roel_service.register.voting import VotingGrid, voting_grid
 from roel_service.scene.clouds import PointCloud
+from roel_service.scene.lines import LineMap
 
 # Cells of local planes and of the voting grid, in distances between points.
 PATCH_CELLS, VOTING_CELLS = 2.0, 7.5
@@ -85,6 +88,31 @@ def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
             axes,
             ROOM_FOR_SOURCE * float(np.linalg.norm(np.ptp(points, axis=0))),
             VOTING_CELLS * resolution_m,
+        ),
+    )
+
+
+def prepare_map(line_map: LineMap, config: RegisterConfig) -> PreparedCloud:
+    """A line map as target: its lines are the creases, and there are no surfaces."""
+    points, line = sample_segments(line_map.segments, config.voxel_m)
+    directions = np.nan_to_num(unit(line_map.segments[:, 1] - line_map.segments[:, 0]))[line]
+    tree = cKDTree(points)
+    creases = Creases(points=points, directions=directions)
+    axes = dominant_directions(directions, np.ones(len(points)))
+    size_m = float(np.linalg.norm(np.ptp(points, axis=0)))
+    nothing = np.empty((0, 3))
+    return PreparedCloud(
+        points=points,
+        tree=tree,
+        resolution_m=config.voxel_m,
+        surface_points=nothing,
+        surface_normals=nothing,
+        surface_tree=cKDTree(nothing),
+        creases=creases,
+        crease_tree=tree,
+        axes=axes,
+        voting=voting_grid(
+            points, creases, axes, ROOM_FOR_SOURCE * size_m, VOTING_CELLS * config.voxel_m
         ),
     )
 

@@ -15,8 +15,8 @@ from roel_service.register.align import Level, align
 from roel_service.register.alignment import Alignment
 from roel_service.register.guesses import Guess, guesses_anywhere, guesses_near
 from roel_service.register.point_to_point import align_points
-from roel_service.register.prepare import PreparedCloud, prepare_cloud
-from roel_service.register.source import Source, source_of_cloud, source_of_map
+from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map
+from roel_service.register.source import Source, require_lines, source_of_cloud, source_of_map
 from roel_service.register.verdict import Rival, agreement, judge
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.lines import LineMap
@@ -41,17 +41,17 @@ START_SCALE_M, START_SCALE_DECAY, START_STEP_COUNT = 0.5, 0.9, 80
 
 def register_map(
     source: LineMap | PreparedCloud,
-    target: PointCloud | PreparedCloud,
+    target: PointCloud | LineMap | PreparedCloud,
     config: RegisterConfig,
     *,
     method: str = "auto",
     T_init: SE3 | None = None,
 ) -> RegistrationResult:
-    """Where a line map lies in a cloud.
+    """Where a line map lies in a cloud, or in another map.
 
     Args:
         source: the map; a prepared cloud is registered by its points and creases.
-        target: the cloud; prepare it once for many registrations.
+        target: the cloud or map; prepare it once for many registrations.
         config: parameters.
         method: one of `METHODS`.
         T_init: first T_target_source; the identity by default, and not looked at by `global`.
@@ -61,10 +61,11 @@ def register_map(
         CloudError: a cloud in another unit than the map.
     """
     moving = source_of_map(source) if isinstance(source, LineMap) else source_of_cloud(source)
-    if isinstance(target, PointCloud):
+    if not isinstance(target, PreparedCloud):
+        points = target.points if isinstance(target, PointCloud) else _ends(target)
         if not config.estimate_scale:
-            require_same_unit(moving, target.points)
-        target = prepare_cloud(target, config)
+            require_same_unit(moving, points)
+        target = _prepared(target, config)
     elif not config.estimate_scale:
         require_same_unit(moving, target.points)
     T_init = T_init or SE3.identity()
@@ -79,6 +80,18 @@ def register_map(
     else:
         guesses = guesses_near(moving, target, T_init, config)
     return _best(guesses, moving, target, config)
+
+
+def _ends(line_map: LineMap) -> FloatArray:
+    """(2 L, 3) the ends of all lines."""
+    require_lines(line_map)
+    return line_map.segments.reshape(-1, 3)
+
+
+def _prepared(target: PointCloud | LineMap, config: RegisterConfig) -> PreparedCloud:
+    if isinstance(target, LineMap):
+        return prepare_map(target, config)
+    return prepare_cloud(target, config)
 
 
 def _best(

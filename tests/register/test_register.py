@@ -89,6 +89,17 @@ def test_global_finds_any_rotation_if_gravity_is_unknown(prepared):
     assert millimetres < 5.0
 
 
+@pytest.mark.parametrize("method", ["auto", "global"])
+def test_a_map_onto_a_map(method):
+    T = SE3(rotation=rotation_from_vector(np.array([0.0, 0.0, 0.4])), translation=[0.3, -0.4, 0.1])
+    target = room_map(seed=5)
+    result = register_map(room_map().transformed(T), target, CONFIG, method=method, T_init=None)
+    degrees, millimetres = errors(result.T_target_source @ T)
+    assert degrees < 0.2
+    assert millimetres < 5.0
+    assert result.verdict is Verdict.ACCEPTED
+
+
 def test_a_map_of_unknown_unit_is_scaled(prepared):
     scaled = LineMap.from_segments(0.37 * room_map().segments)
     config = dataclasses.replace(CONFIG, estimate_scale=True)
