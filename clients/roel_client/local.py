@@ -433,3 +433,34 @@ def bench_mapping(
     text = tables.all_rows(results)
     tables.write_text(out / "mapping.md", text)
     return to_document(results), text
+
+
+def bench_registration(
+    names: list[tuple[str, str]],
+    path: Path,
+    *,
+    max_count: int | None,
+    progress: ProgressCallback,
+) -> tuple[dict[str, Any], str]:
+    """Run the registration benchmark on pairs of map and cloud; its trials, and their page."""
+    from dataclasses import replace
+
+    from roel_bench import registration, registration_report
+    from roel_service.io.clouds import read_cloud
+
+    places = [
+        registration.Place(
+            name=Path(map_name).stem,
+            line_map=_read_map(map_name),
+            cloud=read_cloud(Path(cloud_name)),
+            is_tuning=Path(map_name).stem in registration.TUNING_PLACES,
+        )
+        for map_name, cloud_name in names
+    ]
+    protocols = [
+        replace(protocol, count=min(protocol.count, max_count or protocol.count))
+        for protocol in registration.PROTOCOLS
+    ]
+    document = registration.run(places, protocols, progress)
+    registration.write_document(path, document)
+    return document, registration_report.document(document)

@@ -38,12 +38,12 @@ def roel(folder, *arguments):
 
 
 def test_json_has_the_keys_and_values_of_the_contract(folder):
-    done = roel(folder, "--method", "point", "--init", "T.txt", "--plot", "p.png", "--json")
+    done = roel(folder, "--init", "T.txt", "--plot", "p.png", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     (line,) = done.stdout.splitlines()
     found = json.loads(line)
     T, information = np.array(found["T_target_source"]), np.array(found["information"])
-    np.testing.assert_allclose(T, np.eye(4), atol=0.03)
+    np.testing.assert_allclose(T, np.eye(4), atol=0.005)
     assert information.shape == (6, 6)
     assert (np.linalg.eigvalsh(information) > 0).all()
     assert found["converged"] is True
@@ -81,7 +81,7 @@ def test_strict_says_why(folder, monkeypatch):
         "map.npz",
         "cloud.npz",
         "--method",
-        "point",
+        "plane",
         "--init",
         "far.txt",
         "--strict",
@@ -96,7 +96,7 @@ def test_strict_ends_with_3_and_still_prints_the_result(folder):
     np.savetxt(
         folder / "far.txt", np.array([[1, 0, 0, 9], [0, 1, 0, 9], [0, 0, 1, 9], [0, 0, 0, 1]])
     )
-    done = roel(folder, "--method", "point", "--init", "far.txt", "--strict", "--json")
+    done = roel(folder, "--method", "plane", "--init", "far.txt", "--strict", "--json")
     assert done.returncode == 3
     assert json.loads(done.stdout)["verdict"] == "REJECTED"
     (line,) = done.stderr.splitlines()

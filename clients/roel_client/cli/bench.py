@@ -1,4 +1,4 @@
-"""`roel bench mapping`."""
+"""`roel bench mapping` and `roel bench registration`."""
 
 from __future__ import annotations
 
@@ -7,15 +7,28 @@ import os
 from pathlib import Path
 
 from roel_client.cli.output import print_result, progress_bar
-from roel_client.cli.parser import Command, Subparsers, command, command_group, one_of
+from roel_client.cli.parser import (
+    Command,
+    Subparsers,
+    command,
+    command_group,
+    integer,
+    one_of,
+    suffixed,
+)
 from roel_client.cli.staging import Staged
 
 SUITES = ("quick", "presets", "ablation", "noise", "front-end", "peers", "curves", "full")
 
 
 def add_commands(subparsers: Subparsers) -> None:
-    """Declare `bench mapping`."""
+    """Declare the commands below `bench`."""
     group = command_group(subparsers, "bench", "measure how good the results are")
+    _add_mapping(group)
+    _add_registration(group)
+
+
+def _add_mapping(group: Subparsers) -> None:
     # The folder is no staged output: it keeps the rows of an interrupted run, for the next one.
     what = Command(run=bench_mapping)
     parser = command(group, "mapping", "maps by presets, ablations and peers against truth", what)
@@ -57,6 +70,44 @@ def bench_mapping(options: argparse.Namespace, staged: Staged) -> None:
             methods=tuple(options.variants) if options.variants else None,
             data=Path(data) if data else None,
             rooms=Path(options.rooms) if options.rooms else out / "rooms",
+            progress=progress,
+        )
+    print_result(document, text.rstrip("\n"), as_json=options.json)
+
+
+def _add_registration(group: Subparsers) -> None:
+    what = Command(run=bench_registration, outputs=("out",))
+    parser = command(group, "registration", "maps against clouds of their places", what)
+    parser.add_argument(
+        "--place",
+        action="append",
+        nargs=2,
+        required=True,
+        metavar=("MAP", "CLOUD"),
+        help="a map and the cloud of the same place in the same frame; may be repeated",
+    )
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=suffixed(".json"),
+        metavar="FILE.json",
+        help="every trial; roel_bench.registration_report makes the page of it",
+    )
+    parser.add_argument(
+        "--trials", type=integer(1, 1000), metavar="N", help="at most so many of each kind"
+    )
+    parser.add_argument("--json", action="store_true", help="print all trials as JSON")
+
+
+def bench_registration(options: argparse.Namespace, staged: Staged) -> None:
+    """Run all protocols on all places and print their tables."""
+    from roel_client import local
+
+    with progress_bar() as progress:
+        document, text = local.bench_registration(
+            [(line_map, cloud) for line_map, cloud in options.place],
+            staged["out"],
+            max_count=options.trials,
             progress=progress,
         )
     print_result(document, text.rstrip("\n"), as_json=options.json)
