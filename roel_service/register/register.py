@@ -33,6 +33,8 @@ FOLLOW_UP_SAMPLE_COUNT, FOLLOW_UP_STEP_COUNT, FOLLOW_UP_JUDGED_COUNT = 400, 10, 
 # The last levels start where the follow-up ended.
 SETTLING_SAMPLE_COUNT, LAST_SAMPLE_COUNT = 1500, 6000
 LAST_FIRST_SCALE = 1.25
+# Planes of a sparse scan are no better than this against the distance of its points.
+LAST_SCALE = 0.5
 
 # Methods that follow a first guess by one kind of pull: weights of surfaces and of creases.
 PULLS = {"plane": (1.0, 0.0), "line": (0.0, 1.0)}
@@ -113,7 +115,7 @@ def _best(
         rivals.append(Rival(alignment=ended, score=score))
     best = max(rivals, key=lambda rival: rival.score)
     alignment = best.alignment
-    for level in _last_levels(config, LAST_FIRST_SCALE * target.resolution_m):
+    for level in _last_levels(config, target.resolution_m):
         alignment = align(source.samples, target, alignment, level)
     return judge(alignment, rivals, source, target, config)
 
@@ -125,7 +127,7 @@ def _from_start(
     surface_weight, crease_weight = PULLS[method]
     level = Level(
         first_scale_m=START_SCALE_M,
-        last_scale_m=config.last_scale_m,
+        last_scale_m=max(config.last_scale_m, LAST_SCALE * target.resolution_m),
         sample_count=SETTLING_SAMPLE_COUNT,
         step_count=START_STEP_COUNT,
         scale_decay=START_SCALE_DECAY,
@@ -137,18 +139,17 @@ def _from_start(
     return align(source.samples, target, _start(start), level)
 
 
-def _last_levels(config: RegisterConfig, first_scale_m: float) -> tuple[Level, Level]:
+def _last_levels(config: RegisterConfig, resolution_m: float) -> tuple[Level, Level]:
     """Down to the last scale with some of the samples, then with all of them."""
+    last_scale_m = max(config.last_scale_m, LAST_SCALE * resolution_m)
     settling = Level(
-        first_scale_m=first_scale_m,
-        last_scale_m=config.last_scale_m,
+        first_scale_m=LAST_FIRST_SCALE * resolution_m,
+        last_scale_m=last_scale_m,
         sample_count=SETTLING_SAMPLE_COUNT,
         step_count=config.step_count,
         estimate_scale=config.estimate_scale,
     )
-    all_samples = replace(
-        settling, first_scale_m=config.last_scale_m, sample_count=LAST_SAMPLE_COUNT
-    )
+    all_samples = replace(settling, first_scale_m=last_scale_m, sample_count=LAST_SAMPLE_COUNT)
     return settling, all_samples
 
 
