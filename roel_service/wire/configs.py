@@ -42,11 +42,19 @@ def tables_to_proto(tables: Tables) -> config_pb2.MappingConfig:
 
 
 def tables_from_proto(message: config_pb2.MappingConfig) -> Tables:
-    """The fields that are present, as the tables of a TOML file."""
+    """The fields that are present, as the tables of a TOML file, in the order of that."""
     return {
-        table.name: {field.name: _plain(field, value) for field, value in part.ListFields()}
-        for table, part in message.ListFields()
+        table.name: {
+            field.name: _plain(field, getattr(part, field.name)) for field in _present(part)
+        }
+        for table in _present(message)
+        for part in [getattr(message, table.name)]
     }
+
+
+def _present(message: Any) -> list[FieldDescriptor]:
+    """Fields that are set, as they are declared: their numbers tell when they came to be."""
+    return [field for field in message.DESCRIPTOR.fields if message.HasField(field.name)]
 
 
 def _plain(field: FieldDescriptor, value: Any) -> Any:
