@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 from roel_client.naming import naming
 
 if TYPE_CHECKING:
-    from roel_service.config.stages import Config, RegisterConfig
+    from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
     from roel_service.io.events import EventFile
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
     from roel_service.scene.clouds import PointCloud
     from roel_service.scene.lines import LineMap
-    from roel_service.scene.results import RegistrationResult
+    from roel_service.scene.results import PanoLocResult, RegistrationResult
     from roel_service.scene.trajectory import Trajectory
     from roel_service.wire.rlm import MapFile
 
@@ -285,6 +285,66 @@ def _registration_document(result: RegistrationResult, seconds: float) -> dict[s
             for other in result.alternatives
         ],
         "iteration_count": result.iteration_count,
+        "seconds": seconds,
+    }
+
+
+def localize_panoramas(
+    name: str,
+    panorama_names: list[str],
+    *,
+    prior: str | None,
+    config: LocalizeConfig,
+    overlay: Path | None,
+) -> Iterator[dict[str, Any]]:
+    """Locate panoramas in a map; for each the keys of `roel localize`.
+
+    Every file is read once before the first panorama is located.
+
+    Args:
+        name: of the map.
+        panorama_names: files.
+        prior: file with the first T_world_panorama.
+        config: parameters.
+        overlay: folder to make, for one picture each.
+    """
+    from roel_service.evaluation.panorama_figures import draw_overlay
+    from roel_service.io.images import read_panorama
+    from roel_service.io.transforms import read_transform
+    from roel_service.pano_loc.localize import localize_panorama
+    from roel_service.pano_loc.prepare import prepare_map
+
+    line_map = _read_map(name)
+    T_prior = None if prior is None else read_transform(Path(prior))
+    for panorama_name in panorama_names:
+        read_panorama(Path(panorama_name))
+    prepared = prepare_map(line_map, config)
+    if overlay is not None:
+        overlay.mkdir()
+    for index, panorama_name in enumerate(panorama_names):
+        grey = read_panorama(Path(panorama_name))
+        started_s = time.perf_counter()
+        result = localize_panorama(grey, prepared, config, prior=T_prior)
+        seconds = time.perf_counter() - started_s
+        if overlay is not None:
+            path = overlay / f"{index:03d}-{Path(panorama_name).stem}.png"
+            draw_overlay(grey, line_map, result.T_world_panorama, path)
+        yield _localization_document(panorama_name, result, seconds)
+
+
+def _localization_document(name: str, result: PanoLocResult, seconds: float) -> dict[str, Any]:
+    poses = [
+        {"T_world_panorama": item.T_world_panorama.matrix().tolist(), "score": item.score}
+        for item in result.hypotheses
+    ]
+    return {
+        "panorama": name,
+        "status": result.status.value,
+        "T_world_panorama": poses[0]["T_world_panorama"] if poses else None,
+        "score": result.score,
+        "covariance": result.hypotheses[0].covariance.tolist() if poses else None,
+        "alternatives": poses[1:],
+        "reason": None if result.reason is None else result.reason.value,
         "seconds": seconds,
     }
 

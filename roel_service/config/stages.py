@@ -421,6 +421,38 @@ class RegisterConfig(Stage, table="register"):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LocalizeConfig(Stage, table="localize"):
+    """Panoramas located in maps.
+
+    Attributes:
+        max_width_px: larger panoramas are made this wide first.
+        crop_px: side of the perspective crops in which lines are looked for.
+        min_arc_deg: shortest line of a panorama, as an angle.
+        max_arc_count: longest lines of a panorama that are used.
+        grid_step_m: spacing of the places that are tried first.
+        max_rotation_count: orientations that are tried, best first.
+        candidate_count: poses refined in the first round.
+        max_hypothesis_count: poses at the most in an answer.
+        min_score: a pose that explains less of picture and map together is none.
+        min_coverage: nor is one at which the picture shows less of the map's lines.
+        min_margin: a runner-up this close below the best pose, as a share of its score, leaves the
+            answer open.
+    """
+
+    max_width_px: int = parameter(2048, Rule("512 to 8192", lambda value: 512 <= value <= 8192))
+    crop_px: int = parameter(320, Rule("64 to 1024", lambda value: 64 <= value <= 1024))
+    min_arc_deg: float = parameter(2.0, at_most(45))
+    max_arc_count: int = parameter(500, at_most(5000))
+    grid_step_m: float = parameter(0.4, POSITIVE)
+    max_rotation_count: int = parameter(64, at_most(1000))
+    candidate_count: int = parameter(72, at_most(1000))
+    max_hypothesis_count: int = parameter(5, Rule("1 to 5", lambda value: 1 <= value <= 5))
+    min_score: float = parameter(0.33, SHARE)
+    min_coverage: float = parameter(0.4, SHARE)
+    min_margin: float = parameter(0.2, SHARE)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RuntimeConfig(Stage, table="runtime"):
     """How the work is done; nothing but speed depends on it, except for the seed.
 
@@ -481,3 +513,4 @@ class Config:
     register: RegisterConfig = RegisterConfig()
     runtime: RuntimeConfig = RuntimeConfig()
     curves: CurvesConfig = CurvesConfig()
+    localize: LocalizeConfig = LocalizeConfig()

@@ -172,3 +172,70 @@ class PoseResult:
     trajectory: Trajectory
     covariance: FloatArray
     report: PoseReport
+
+
+class LocalizationStatus(Enum):
+    """Whether the pose of a picture may be relied on."""
+
+    FOUND = "FOUND"  # within 0.3 m and 15 degrees
+    AMBIGUOUS = "AMBIGUOUS"  # another pose fits about as well
+    NOT_FOUND = "NOT_FOUND"
+
+
+class NoPoseReason(Enum):
+    """Why a localization has no plain answer."""
+
+    INSUFFICIENT_LINES = "INSUFFICIENT_LINES"
+    NOT_IN_MAP = "NOT_IN_MAP"
+    DEGENERATE = "DEGENERATE"
+    AMBIGUOUS = "AMBIGUOUS"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PoseHypothesis:
+    """A pose that explains a picture.
+
+    Attributes:
+        T_world_panorama: the pose.
+        score: how well picture and map explain each other, 0 to 1.
+        covariance: (6, 6) of (r, d), rad and m, world.
+        explained_2d: share of the picture's lines that the map explains, 0 to 1.
+        explained_3d: share of the map's lines in view that the picture explains, 0 to 1.
+    """
+
+    T_world_panorama: SE3
+    score: float
+    covariance: FloatArray
+    explained_2d: float
+    explained_3d: float
+
+    def __post_init__(self) -> None:
+        covariance = frozen_array(self.covariance, np.float64, (6, 6), "covariance")
+        object.__setattr__(self, "covariance", covariance)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PanoLocResult:
+    """Where a panorama was taken.
+
+    Attributes:
+        status: whether the best pose may be relied on.
+        reason: why there is no plain answer; None exactly when it was found.
+        hypotheses: poses, best first; none when it was not found.
+        score: that of the best pose, in the map or not.
+        margin: how far, as a share of the best score, the best pose elsewhere falls behind.
+        arc_count: lines in the picture.
+        rotation_count: orientations that were tried.
+    """
+
+    status: LocalizationStatus
+    reason: NoPoseReason | None
+    hypotheses: tuple[PoseHypothesis, ...]
+    score: float
+    margin: float
+    arc_count: int
+    rotation_count: int
+
+    @property
+    def T_world_panorama(self) -> SE3 | None:
+        return self.hypotheses[0].T_world_panorama if self.hypotheses else None

@@ -18,6 +18,7 @@ from roel_client.cli import (
     demo,
     evaluate,
     health,
+    localize,
     maps,
     poses,
     register,
@@ -142,6 +143,7 @@ def parser() -> Parser:
     for group in (
         maps,
         register,
+        localize,
         poses,
         evaluate,
         simulate,
@@ -168,7 +170,13 @@ def named_files(command: Command, options: argparse.Namespace) -> NamedFiles:
     """The files and folders that the user named."""
 
     def given(names: tuple[str, ...]) -> dict[str, str]:
-        return {name: value for name in names if (value := getattr(options, name)) is not None}
+        found = {}
+        for name in names:
+            value = getattr(options, name)
+            for index, item in enumerate(value if isinstance(value, list) else [value]):
+                if item is not None:
+                    found[f"{name}[{index}]" if index else name] = item
+        return found
 
     return NamedFiles(
         inputs=given(command.inputs),

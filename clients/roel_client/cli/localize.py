@@ -1,0 +1,88 @@
+"""`roel localize`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from typing import Any
+
+from roel_client.cli.configuration import effective_config
+from roel_client.cli.output import print_result
+from roel_client.cli.parser import Command, Subparsers, UsageError, command, one_of
+from roel_client.cli.staging import Staged
+from roel_service.errors import NoAnswerError
+
+FOUND = "FOUND"
+
+
+def add_commands(subparsers: Subparsers) -> None:
+    """Declare `localize`."""
+    what = Command(
+        run=localize, inputs=("map", "panoramas", "prior", "config"), folders=("overlay",)
+    )
+    parser = command(subparsers, "localize", "find where panoramas were taken in a map", what)
+    parser.add_argument("map", metavar="MAP", help=".rlm file or exported .npz")
+    parser.add_argument(
+        "panoramas",
+        metavar="PANO",
+        nargs="+",
+        help="equirectangular JPEG or PNG, width twice the height",
+    )
+    parser.add_argument(
+        "--prior", metavar="T.txt", help="first T_world_panorama, within 1 m, 30 deg"
+    )
+    parser.add_argument(
+        "--preset",
+        default="default",
+        type=one_of("default", "paper"),
+        metavar="NAME",
+        help="default",
+    )
+    parser.add_argument("--config", metavar="FILE.toml", help="parameters that differ")
+    parser.add_argument("--overlay", metavar="DIR", help="pictures with the map's lines over them")
+    parser.add_argument("--strict", action="store_true", help="end with 3 unless all are FOUND")
+    parser.add_argument("--json", action="store_true", help="print as JSON, one line a panorama")
+
+
+def localize(options: argparse.Namespace, staged: Staged) -> None:
+    """Locate panoramas, and print where each was taken as soon as it is known."""
+    from roel_client import local
+
+    if options.preset == "paper":
+        raise UsageError("--preset", "default, the one preset of localization so far", "paper")
+    documents: Iterable[dict[str, Any]] = local.localize_panoramas(
+        options.map,
+        options.panoramas,
+        prior=options.prior,
+        config=effective_config(options).localize,
+        overlay=staged.get("overlay"),
+    )
+    if options.strict and not options.json:
+        # Without an answer for all, nothing goes to stdout.
+        documents = list(documents)
+        require_found(documents)
+    lost = []
+    for document in documents:
+        print_result(document, told(document), as_json=options.json)
+        lost += [] if document["status"] == FOUND else [document]
+    if options.strict:
+        require_found(lost)
+
+
+def require_found(documents: Iterable[dict[str, Any]]) -> None:
+    """Raise `NoAnswerError` about the first panorama without a pose to rely on."""
+    for document in documents:
+        if document["status"] != FOUND:
+            raise NoAnswerError(
+                document["panorama"], "a pose to rely on", document["reason"], reason="NOT_LOCATED"
+            )
+
+
+def told(document: dict[str, Any]) -> str:
+    """The pose for people."""
+    reason = "" if document["reason"] is None else f" ({document['reason']})"
+    head = f"{document['panorama']}: {document['status']}{reason}, score {document['score']:.2f}"
+    rows = [
+        " ".join(f"{value:12.9f}" for value in row) for row in document["T_world_panorama"] or []
+    ]
+    return "\n".join([head, *rows])

@@ -1,0 +1,238 @@
+"""Poses made exact: rotation and translation jointly, over matches of arcs with map lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.arrays import BoolArray, FloatArray, IntArray
+from roel_service.config.stages import LocalizeConfig
+from roel_service.geometry.se3 import SE3, rotation_angle
+from roel_service.pano_loc import refine_kernels
+from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.pano_loc.prepare import PreparedMap
+from roel_service.pano_loc.search import Candidates
+
+# A step goes no farther; beyond it the residuals are not linear.
+MAX_SHIFT_M = 0.3
+MAX_TURN_RAD = np.deg2rad(8.0)
+DAMPING = 1e-3
+# Places are compared by so many arcs, at samples so far apart, and so many lines.
+PLACED_ARC_COUNT, PLACED_STEP_RAD, PLACED_LINE_COUNT = 200, np.deg2rad(6.0), 400
+PLACED_GATE_RAD = np.deg2rad(3.0)
+# Least squares: distance of samples, gate between arc and line, kernel width of each iteration.
+FINAL_STEP_RAD = np.deg2rad(2.0)
+FINAL_GATE_RAD = np.deg2rad(5.0)
+FINAL_WIDTHS_RAD = np.deg2rad([0.7, 0.5, 0.5, 0.5])
+# The same for more of the modes, on fewer arcs.
+MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([2.0, 1.5, 1.0, 0.7])
+# Width of the kernel of a pose's score.
+SCORE_WIDTH_RAD = np.deg2rad(0.7)
+SCORE_GATE_RAD = np.deg2rad(6.0)
+# Poses closer than this in both are one.
+SAME_POSE_M, SAME_POSE_RAD = 0.25, np.deg2rad(8.0)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Samples:
+    """Rays along the arcs, at about equal angles.
+
+    Attributes:
+        rays: (S, 3) unit, panorama frame; those of arc a are offsets[a]:offsets[a + 1].
+        offsets: (A + 1,).
+        weight: (S,) angle that each stands for, rad.
+        normals: (A, 3) of the arcs.
+    """
+
+    rays: FloatArray
+    offsets: IntArray
+    weight: FloatArray
+    normals: FloatArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Round:
+    """One round of the search for better places, orientations as they are.
+
+    Attributes:
+        candidate_count: poses that take part, the best ones.
+        reach: places around each are tried so far away along each axis, in steps of the grid.
+        width_rad: kernel of the score.
+    """
+
+    candidate_count: int
+    reach: float
+    width_rad: float
+
+
+def rounds(candidate_count: int) -> tuple[Round, ...]:
+    """Fewer poses, finer, from round to round."""
+    return (
+        Round(candidate_count=candidate_count, reach=0.5, width_rad=np.deg2rad(2.0)),
+        Round(candidate_count=40, reach=0.25, width_rad=np.deg2rad(1.2)),
+        Round(candidate_count=28, reach=0.125, width_rad=np.deg2rad(0.7)),
+    )
+
+
+def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
+    """At least two rays an arc, in the middles of equal parts."""
+    counts = np.maximum(np.ceil(arcs.length_rad / step_rad), 2).astype(np.int64)
+    arc = np.repeat(np.arange(len(arcs)), counts)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    share = (np.arange(len(arc)) - offsets[arc] + 0.5) / counts[arc]
+    turn_rad = (share * arcs.length_rad[arc])[:, None]
+    aside = np.cross(arcs.normals, arcs.starts)
+    return Samples(
+        rays=np.cos(turn_rad) * arcs.starts[arc] + np.sin(turn_rad) * aside[arc],
+        offsets=offsets,
+        weight=arcs.length_rad[arc] / counts[arc],
+        normals=np.ascontiguousarray(arcs.normals),
+    )
+
+
+def refine_poses(
+    candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, config: LocalizeConfig
+) -> Candidates:
+    """Modes of the best fit, best first; each scored by the share of the arcs that it explains.
+
+    Places are looked for on ever finer grids before anything is linearised: among hundreds of
+    parallel lines, least squares from a grid's step away ends at the wrong ones.
+    """
+    few = sample_arcs(arcs.take(np.arange(min(len(arcs), PLACED_ARC_COUNT))), PLACED_STEP_RAD)
+    for stage in rounds(config.candidate_count):
+        candidates = distinct(candidates, stage.candidate_count)
+        candidates = _moved(candidates, few, prepared, stage)
+    modes = _refined(distinct(candidates, MODE_COUNT), few, prepared, MODE_WIDTHS_RAD)
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
+    best = distinct(modes, config.max_hypothesis_count)
+    return distinct(
+        _refined(best, samples, prepared, FINAL_WIDTHS_RAD), config.max_hypothesis_count
+    )
+
+
+def _moved(
+    candidates: Candidates, samples: Samples, prepared: PreparedMap, stage: Round
+) -> Candidates:
+    """Each candidate at the best place around it."""
+    axis = stage.reach * prepared.step_m * np.array([-1.0, 0.0, 1.0])
+    around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
+    places, scores = [], []
+    for index in range(len(candidates)):
+        pose = candidates.poses[index]
+        tried = pose.translation + around
+        score = refine_kernels.place_scores(
+            samples.rays @ pose.rotation.T,
+            samples.offsets,
+            samples.weight,
+            samples.normals @ pose.rotation.T,
+            prepared.segments[:PLACED_LINE_COUNT],
+            prepared.directions[:PLACED_LINE_COUNT],
+            tried,
+            stage.width_rad,
+            PLACED_GATE_RAD,
+        )
+        best = int(score.argmax())
+        places.append(tried[best])
+        scores.append(score[best])
+    poses = SE3(rotation=candidates.poses.rotation, translation=np.array(places).reshape(-1, 3))
+    return Candidates(poses=poses, score=np.array(scores))
+
+
+def distinct(candidates: Candidates, max_count: int) -> Candidates:
+    """The best candidates, each the only one of its neighbourhood, best first."""
+    candidates = candidates.ranked()
+    poses = candidates.poses
+    kept: list[int] = []
+    for index in range(len(candidates)):
+        if len(kept) == max_count:
+            break
+        shift_m = np.linalg.norm(poses.translation[kept] - poses.translation[index], axis=1)
+        turn_rad = rotation_angle(poses.rotation[kept] @ poses.rotation[index].T)
+        if not ((shift_m < SAME_POSE_M) & (turn_rad < SAME_POSE_RAD)).any():
+            kept.append(index)
+    return candidates.take(np.array(kept, dtype=np.int64))
+
+
+def _refined(
+    candidates: Candidates, samples: Samples, prepared: PreparedMap, widths_rad: FloatArray
+) -> Candidates:
+    """Each candidate after robust least squares over rotation and place."""
+    poses, scores = [], []
+    for index in range(len(candidates)):
+        pose = candidates.poses[index]
+        for width_rad in widths_rad:
+            pose = pose.retract(_step(*equations(pose, samples, prepared, width_rad)))
+        poses.append(pose)
+        scores.append(explained(pose, samples, prepared))
+    return Candidates(
+        poses=SE3(
+            rotation=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
+            translation=np.array([pose.translation for pose in poses]).reshape(-1, 3),
+        ),
+        score=np.array(scores),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Matches:
+    """Rays of a picture in the world's frame, and the lines that they lie on.
+
+    Attributes:
+        rays: (S, 3) unit.
+        seen: the lines from the pose's place.
+        line: (S,) index, -1 for none.
+        residual: (S,) sine of the angle between ray and line.
+    """
+
+    rays: FloatArray
+    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]
+    line: IntArray
+    residual: FloatArray
+
+
+def match(pose: SE3, samples: Samples, prepared: PreparedMap, max_angle_rad: float) -> Matches:
+    """The nearest line of each ray, among those that the arc may be."""
+    rays, normals = samples.rays @ pose.rotation.T, samples.normals @ pose.rotation.T
+    seen = refine_kernels.viewed_lines(prepared.segments, pose.translation)
+    pairs = refine_kernels.alike(normals, prepared.directions, max_angle_rad)
+    line, residual = refine_kernels.match_rays(
+        rays, samples.offsets, normals, pairs, seen, max_angle_rad
+    )
+    return Matches(rays=rays, seen=seen, line=line, residual=residual)
+
+
+def equations(
+    pose: SE3, samples: Samples, prepared: PreparedMap, width_rad: float
+) -> tuple[FloatArray, FloatArray]:
+    """(6, 6) and (6,) of the Gauss-Newton step at a pose, tangent (r, d)."""
+    found = match(pose, samples, prepared, FINAL_GATE_RAD)
+    H, g = refine_kernels.normal_equations(
+        found.rays,
+        samples.weight,
+        prepared.segments,
+        found.seen,
+        found.line,
+        found.residual,
+        width_rad,
+    )
+    return H, g
+
+
+def explained(pose: SE3, samples: Samples, prepared: PreparedMap) -> float:
+    """Share of the arcs' length that lines of the map explain, 0 to 1."""
+    found = match(pose, samples, prepared, SCORE_GATE_RAD)
+    fit = np.where(found.line >= 0, np.exp(-0.5 * (found.residual / SCORE_WIDTH_RAD) ** 2), 0.0)
+    return float(samples.weight @ fit / max(samples.weight.sum(), 1e-9))
+
+
+def _step(H: FloatArray, g: FloatArray) -> FloatArray:
+    """(6,) damped step, shortened to what stays linear."""
+    damping = DAMPING * np.diag(np.maximum(np.diag(H), 1e-9))
+    step = -np.linalg.solve(H + damping, g)
+    shrink = max(
+        1.0,
+        float(np.linalg.norm(step[:3])) / MAX_TURN_RAD,
+        float(np.linalg.norm(step[3:])) / MAX_SHIFT_M,
+    )
+    return np.asarray(step / shrink)

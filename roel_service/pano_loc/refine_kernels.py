@@ -1,0 +1,225 @@
+"""Loops over arcs and map lines at one pose."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from roel_service.arrays import BoolArray, FloatArray, IntArray
+
+# Lines whose viewing plane is not defined, or closer to the centre than this, are left out, m.
+MIN_DISTANCE_M = 0.05
+# A ray belongs to a line's image up to this far beyond its ends.
+END_SLACK_SINE = np.sin(np.deg2rad(1.5))
+# Viewing planes of arc and line differ by no more than this, or the arc's own error if larger.
+MIN_NORMAL_GATE_RAD = np.deg2rad(15.0)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@numba.njit(cache=True, nogil=True)
+def viewed_lines(
+    segments: FloatArray, place: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Lines as seen from a place: normals, their lengths (m^2), two end normals, and which count.
+
+    The end normals n x start and end x n point into the image of the line.
+    """
+    count = len(segments)
+    normal, from_start, to_end = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
+    moment, sound = np.zeros(count), np.zeros(count, np.bool_)
+    px, py, pz = place
+    for j in range(count):
+        # In scalars: arrays of three would be allocated thousands of times a pose.
+        ax, ay, az = segments[j, 0, 0] - px, segments[j, 0, 1] - py, segments[j, 0, 2] - pz
+        bx, by, bz = segments[j, 1, 0] - px, segments[j, 1, 1] - py, segments[j, 1, 2] - pz
+        mx, my, mz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        size = np.sqrt(mx * mx + my * my + mz * mz)
+        length = np.sqrt((bx - ax) ** 2 + (by - ay) ** 2 + (bz - az) ** 2)
+        if size < MIN_DISTANCE_M * length or length == 0.0:
+            continue
+        nx, ny, nz = mx / size, my / size, mz / size
+        normal[j, 0], normal[j, 1], normal[j, 2] = nx, ny, nz
+        moment[j], sound[j] = size, True
+        near, far = np.sqrt(ax * ax + ay * ay + az * az), np.sqrt(bx * bx + by * by + bz * bz)
+        from_start[j, 0] = (ny * az - nz * ay) / near
+        from_start[j, 1] = (nz * ax - nx * az) / near
+        from_start[j, 2] = (nx * ay - ny * ax) / near
+        to_end[j, 0] = (by * nz - bz * ny) / far
+        to_end[j, 1] = (bz * nx - bx * nz) / far
+        to_end[j, 2] = (bx * ny - by * nx) / far
+    return normal, moment, from_start, to_end, sound
+
+
+@numba.njit(cache=True, nogil=True)
+def alike(
+    normals: FloatArray, directions: FloatArray, max_angle_rad: float
+) -> tuple[IntArray, IntArray]:
+    """Lines that may be each arc by their directions alone, stored ragged: offsets and lines."""
+    offsets = np.zeros(len(normals) + 1, np.int64)
+    lines = np.empty(len(normals) * len(directions), np.int64)
+    sine = np.sin(max_angle_rad)
+    count = 0
+    for a in range(len(normals)):
+        x, y, z = normals[a]
+        for j in range(len(directions)):
+            if abs(x * directions[j, 0] + y * directions[j, 1] + z * directions[j, 2]) <= sine:
+                lines[count] = j
+                count += 1
+        offsets[a + 1] = count
+    return offsets, lines[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def match_rays(
+    rays: FloatArray,
+    offsets: IntArray,
+    normals: FloatArray,
+    pairs: tuple[IntArray, IntArray],
+    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
+    max_angle_rad: float,
+) -> tuple[IntArray, FloatArray]:
+    """(S,) line that each ray of an arc lies nearest to, -1 for none; (S,) sine of the angle.
+
+    Lines must hold the ray between their ends, and their viewing planes agree with the arc's.
+
+    Args:
+        rays: (S, 3) unit, world; those of arc a are offsets[a]:offsets[a + 1].
+        offsets: (A + 1,).
+        normals: (A, 3) unit, of the arcs, world.
+        pairs: what `alike` found.
+        seen: what `viewed_lines` found.
+        max_angle_rad: between viewing planes.
+    """
+    normal, _, from_start, to_end, sound = seen
+    line = np.full(len(rays), -1, np.int64)
+    residual = np.zeros(len(rays))
+    cosine = np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD))
+    for a in range(len(normals)):
+        for pair in range(pairs[0][a], pairs[0][a + 1]):
+            j = pairs[1][pair]
+            if not sound[j] or abs(_dot(normals[a], normal[j])) < cosine:
+                continue
+            for s in range(offsets[a], offsets[a + 1]):
+                if _dot(rays[s], from_start[j]) < -END_SLACK_SINE:
+                    continue
+                if _dot(rays[s], to_end[j]) < -END_SLACK_SINE:
+                    continue
+                off = _dot(rays[s], normal[j])
+                if line[s] < 0 or abs(off) < abs(residual[s]):
+                    line[s], residual[s] = j, off
+    return line, residual
+
+
+@numba.njit(cache=True, nogil=True)
+def place_scores(
+    rays: FloatArray,
+    offsets: IntArray,
+    weight: FloatArray,
+    normals: FloatArray,
+    segments: FloatArray,
+    directions: FloatArray,
+    places: FloatArray,
+    width_rad: float,
+    max_angle_rad: float,
+) -> FloatArray:
+    """(T,) weight of the rays that lines explain, seen from each of (T, 3) places.
+
+    Rays and normals are in the world's frame: the orientation is the same everywhere.
+    """
+    pairs = alike(normals, directions, max_angle_rad)
+    score = np.zeros(len(places))
+    for t in range(len(places)):
+        seen = viewed_lines(segments, places[t])
+        line, residual = match_rays(rays, offsets, normals, pairs, seen, max_angle_rad)
+        for s in range(len(rays)):
+            if line[s] >= 0:
+                score[t] += weight[s] * np.exp(-0.5 * (residual[s] / width_rad) ** 2)
+    return score
+
+
+@numba.njit(cache=True, nogil=True)
+def normal_equations(
+    rays: FloatArray,
+    weight: FloatArray,
+    segments: FloatArray,
+    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
+    line: IntArray,
+    residual: FloatArray,
+    scale_rad: float,
+) -> tuple[FloatArray, FloatArray]:
+    """(6, 6) and (6,) Gauss-Newton sums of Geman-McClure weighted residuals, tangent (r, d).
+
+    The residual of a ray y is y . N, N the unit normal of the plane of centre and line; rays are in
+    the world's frame.
+    """
+    normal, moment = seen[0], seen[1]
+    H, g = np.zeros((6, 6)), np.zeros(6)
+    J = np.empty(6)
+    for s in range(len(rays)):
+        j = line[s]
+        if j < 0 or abs(residual[s]) > 3.0 * scale_rad:
+            continue
+        jacobian(rays[s], segments[j], normal[j], moment[j], J)
+        robust = weight[s] / (1.0 + (residual[s] / scale_rad) ** 2) ** 2
+        for p in range(6):
+            g[p] += robust * residual[s] * J[p]
+            for q in range(6):
+                H[p, q] += robust * J[p] * J[q]
+    return H, g
+
+
+@numba.njit(cache=True, nogil=True)
+def jacobian(
+    ray: FloatArray, segment: FloatArray, normal: FloatArray, moment: float, out: FloatArray
+) -> None:
+    """Derivative of ray . N by the turn and the shift of the pose, into `out` (6,)."""
+    along = _dot(ray, normal)
+    _cross(ray, normal, out[:3])
+    _cross(segment[0] - segment[1], ray - along * normal, out[3:])
+    out[3:] /= moment
+
+
+@numba.njit(cache=True, nogil=True)
+def match_points(
+    points: FloatArray,
+    directions: FloatArray,
+    normals: FloatArray,
+    from_start: FloatArray,
+    to_end: FloatArray,
+    max_angle_rad: float,
+) -> FloatArray:
+    """(P,) least angle, rad, between points of map lines and arcs alike in direction.
+
+    Infinite where no arc passes.
+
+    Args:
+        points: (P, 3) unit rays to points of lines, panorama frame.
+        directions: (P, 3) unit, of the lines, panorama frame.
+        normals: (A, 3) unit, of the arcs.
+        from_start, to_end: (A, 3) unit, normal x start and end x normal.
+        max_angle_rad: gate.
+    """
+    nearest = np.full(len(points), np.inf)
+    sine = np.sin(max_angle_rad)
+    for p in range(len(points)):
+        for a in range(len(normals)):
+            off = abs(_dot(points[p], normals[a]))
+            if off > sine or off > nearest[p] or abs(_dot(directions[p], normals[a])) > sine:
+                continue
+            if _dot(points[p], from_start[a]) < -END_SLACK_SINE:
+                continue
+            if _dot(points[p], to_end[a]) < -END_SLACK_SINE:
+                continue
+            nearest[p] = np.arcsin(off)
+    return nearest

@@ -1,0 +1,171 @@
+"""How well a pose fits in both directions, how firmly it is held, and whether to rely on it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roel_service.arrays import FloatArray
+from roel_service.config.stages import LocalizeConfig
+from roel_service.geometry.se3 import SE3, rotation_angle
+from roel_service.geometry.segments import sample_segments
+from roel_service.geometry.vectors import dot, norm
+from roel_service.pano_loc import refine_kernels
+from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.pano_loc.prepare import PreparedMap
+from roel_service.pano_loc.refine import (
+    FINAL_STEP_RAD,
+    FINAL_WIDTHS_RAD,
+    SCORE_GATE_RAD,
+    SCORE_WIDTH_RAD,
+    Samples,
+    equations,
+    explained,
+    sample_arcs,
+)
+from roel_service.pano_loc.search import Candidates
+from roel_service.scene.results import (
+    LocalizationStatus,
+    NoPoseReason,
+    PanoLocResult,
+    PoseHypothesis,
+)
+
+# Fewer lines on either side hold no pose, whatever they are.
+MIN_ARC_COUNT, MIN_ARC_TOTAL_RAD = 20, np.deg2rad(150.0)
+MIN_LINE_COUNT = 12
+# Poses farther apart than either of these are different answers; `FOUND` promises the same.
+SAME_ANSWER_M, SAME_ANSWER_RAD = 0.3, np.deg2rad(15.0)
+# Along a direction that is less certain than this there is no answer.
+MAX_SIGMA_M, MAX_SIGMA_RAD = 0.3, np.deg2rad(15.0)
+# Map lines may be hidden: their share counts half.
+COVERAGE_WEIGHT = 0.5
+POINT_SPACING_M = 0.1
+# Errors of the samples of one line are alike: so many degrees of arc count as one measurement.
+INDEPENDENT_RAD = np.deg2rad(20.0)
+# No pose is more certain than the map's own frame.
+FLOOR_RAD, FLOOR_M = np.deg2rad(0.02), 1e-3
+
+
+def enough_lines(arcs: PanoramaArcs, prepared: PreparedMap) -> bool:
+    """Whether picture and map have the lines that an answer needs."""
+    seen = len(arcs) >= MIN_ARC_COUNT and arcs.length_rad.sum() >= MIN_ARC_TOTAL_RAD
+    return bool(seen and len(prepared) >= MIN_LINE_COUNT and len(prepared.places))
+
+
+def no_answer(reason: NoPoseReason, arcs: PanoramaArcs) -> PanoLocResult:
+    """The result without a search."""
+    return PanoLocResult(
+        status=LocalizationStatus.NOT_FOUND,
+        reason=reason,
+        hypotheses=(),
+        score=0.0,
+        margin=0.0,
+        arc_count=len(arcs),
+        rotation_count=0,
+    )
+
+
+def judge(
+    candidates: Candidates,
+    arcs: PanoramaArcs,
+    prepared: PreparedMap,
+    rotation_count: int,
+    config: LocalizeConfig,
+) -> PanoLocResult:
+    """The candidates, weighed in both directions, and the status of the best."""
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
+    found = [
+        _hypothesis(candidates.poses[index], arcs, samples, prepared)
+        for index in range(len(candidates))
+    ]
+    found.sort(key=lambda item: -item.score)
+    margin = _margin(found)
+    reason = _reason(found[0], margin, config)
+    status = {
+        None: LocalizationStatus.FOUND,
+        NoPoseReason.AMBIGUOUS: LocalizationStatus.AMBIGUOUS,
+    }.get(reason, LocalizationStatus.NOT_FOUND)
+    return PanoLocResult(
+        status=status,
+        reason=reason,
+        hypotheses=() if status is LocalizationStatus.NOT_FOUND else tuple(found),
+        score=found[0].score,
+        margin=margin,
+        arc_count=len(arcs),
+        rotation_count=rotation_count,
+    )
+
+
+def _reason(best: PoseHypothesis, margin: float, config: LocalizeConfig) -> NoPoseReason | None:
+    """Why the best pose may not be relied on; None if it may."""
+    sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])
+    sigma_m = np.sqrt(np.linalg.eigvalsh(best.covariance[3:, 3:])[-1])
+    if best.score < config.min_score or best.explained_3d < config.min_coverage:
+        return NoPoseReason.NOT_IN_MAP
+    if sigma > MAX_SIGMA_RAD or sigma_m > MAX_SIGMA_M:
+        return NoPoseReason.DEGENERATE
+    if margin < config.min_margin:
+        return NoPoseReason.AMBIGUOUS
+    return None
+
+
+def _margin(found: list[PoseHypothesis]) -> float:
+    """1 without a pose that would be another answer."""
+    best = found[0]
+    others = [item.score for item in found[1:] if not is_same_answer(best, item)]
+    return 1.0 - max(others, default=0.0) / max(best.score, 1e-9)
+
+
+def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
+    """Whether two poses are within what `FOUND` promises."""
+    T_a, T_b = a.T_world_panorama, b.T_world_panorama
+    turn_rad = rotation_angle(T_a.rotation @ T_b.rotation.T)
+    shift_m = np.linalg.norm(T_a.translation - T_b.translation)
+    return bool(turn_rad <= SAME_ANSWER_RAD and shift_m <= SAME_ANSWER_M)
+
+
+def _hypothesis(
+    pose: SE3, arcs: PanoramaArcs, samples: Samples, prepared: PreparedMap
+) -> PoseHypothesis:
+    explained_2d = explained(pose, samples, prepared)
+    explained_3d = covered(pose, arcs, prepared)
+    score = (explained_2d + COVERAGE_WEIGHT * explained_3d) / (1.0 + COVERAGE_WEIGHT)
+    return PoseHypothesis(
+        T_world_panorama=pose,
+        score=score,
+        covariance=_covariance(pose, samples, prepared),
+        explained_2d=explained_2d,
+        explained_3d=explained_3d,
+    )
+
+
+def covered(pose: SE3, arcs: PanoramaArcs, prepared: PreparedMap) -> float:
+    """Share of the map's lines, by the angle that they take up, on which an arc lies; 0 to 1."""
+    points, line = sample_segments(prepared.segments, POINT_SPACING_M)
+    directions = prepared.directions[line]
+    offset = points - pose.translation
+    distance_m = np.maximum(norm(offset), refine_kernels.MIN_DISTANCE_M)
+    rays = offset / distance_m[:, None]
+    angle_rad = refine_kernels.match_points(
+        rays @ pose.rotation,
+        directions @ pose.rotation,
+        arcs.normals,
+        np.cross(arcs.normals, arcs.starts),
+        np.cross(arcs.ends, arcs.normals),
+        SCORE_GATE_RAD,
+    )
+    along = dot(rays, directions)
+    weight = np.sqrt(np.maximum(0.0, 1.0 - along**2)) / distance_m
+    fit = np.exp(-0.5 * (np.minimum(angle_rad, 1.0) / SCORE_WIDTH_RAD) ** 2)
+    return float(weight @ fit / max(weight.sum(), 1e-9))
+
+
+def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap) -> FloatArray:
+    """(6, 6) of (r, d): the kernel's width as the noise of independent stretches of arc."""
+    H, _ = equations(pose, samples, prepared, FINAL_WIDTHS_RAD[-1])
+    information = H / (INDEPENDENT_RAD * FINAL_WIDTHS_RAD[-1] ** 2)
+    # What nothing holds gets a large but finite variance.
+    weakest = np.diag([1e-2] * 6)
+    floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
+    covariance = np.linalg.inv(information + weakest) + floor
+    return np.asarray((covariance + covariance.T) / 2)
