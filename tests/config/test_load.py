@@ -33,6 +33,11 @@ CHOICES = {
     "trim.method": TRIM_METHODS,
     "curves.method": CURVE_METHODS,
 }
+RANGES = {
+    "localize.max_width_px": (512, 8192),
+    "localize.crop_px": (64, 1024),
+    "localize.max_hypothesis_count": (1, 5),
+}
 
 
 def values_of(path, value):
@@ -53,6 +58,8 @@ def values_of(path, value):
         return st.integers(1, 10_000)
     if path == "frames.max_half_window_us":
         return st.integers(10_000, 100_000)
+    if path in RANGES:
+        return st.integers(*RANGES[path])
     if isinstance(value, int):
         return st.integers(2, 256)
     return st.floats(0.1, 1.0)
