@@ -1,8 +1,9 @@
-"""`roel demo`: simulate, build, compare with the truth, show."""
+"""`roel demo`: simulate, build, compare with the truth, register, show."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,21 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
     local.draw_map(built, recording, folder / "map.png")
     truth = str(room / "gt.npz")
     figures = local.evaluate_map(str(folder / "map.rlm"), truth, truth)
+    registration = local.register_map(
+        str(folder / "map.rlm"),
+        str(room / "cloud.npz"),
+        init=None,
+        method="global",
+        config=load_config("default").register,
+        plot=folder / "registration.png",
+    )
     picture = None if options.out is None else str(Path(options.out, "map.png"))
-    document = {"report": built.report, "evaluation": figures, "picture": picture}
+    document = {
+        "report": built.report,
+        "evaluation": figures,
+        "registration": registration,
+        "picture": picture,
+    }
     print_result(document, _told(document), as_json=options.json)
 
 
@@ -57,6 +71,19 @@ def _told(document: dict[str, Any]) -> str:
             f"built {report['line_count']} lines from {report['event_count']} events of a "
             f"simulated room in {report['seconds_total']:.1f} s",
             evaluate.told(document["evaluation"]),
+            _told_registration(document["registration"]),
             f"picture: {picture}" if picture else "nothing is kept; --out DIR keeps it all",
         ]
+    )
+
+
+def _told_registration(found: dict[str, Any]) -> str:
+    """How far from the truth the map was found in the room's cloud: both lie in the same frame."""
+    T = found["T_target_source"]
+    cosine = (T[0][0] + T[1][1] + T[2][2] - 1.0) / 2.0
+    turn_deg = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    shift_mm = 1e3 * math.hypot(*(row[3] for row in T[:3]))
+    return (
+        f"found in the room's point cloud without a first guess: {turn_deg:.2f} degrees and "
+        f"{shift_mm:.1f} mm off, {found['verdict']}"
     )
