@@ -6,7 +6,12 @@ import pytest
 
 from roel_service.config.load import to_tables
 from roel_service.config.presets import preset
-from roel_service.config.stages import DetectConfig, RuntimeConfig
+from roel_service.config.stages import (
+    DetectConfig,
+    LocalizeConfig,
+    RegisterConfig,
+    RuntimeConfig,
+)
 from roel_service.errors import NoAnswerError
 from roel_service.jobs.build import build_map, config_digest, run_build
 from roel_service.jobs.inputs import BuildParameters
@@ -251,4 +256,7 @@ def test_the_digest_follows_every_parameter_but_the_number_of_workers():
     other_seed = dataclasses.replace(CONFIG, runtime=RuntimeConfig(seed=1))
     more_workers = dataclasses.replace(CONFIG, runtime=RuntimeConfig(worker_count=9))
     assert config_digest(CONFIG) == config_digest(more_workers)
+    register, localize = RegisterConfig(voxel_m=0.5), LocalizeConfig(min_score=0.9)
+    later_jobs = dataclasses.replace(CONFIG, register=register, localize=localize)
+    assert config_digest(CONFIG) == config_digest(later_jobs)
     assert len({config_digest(item) for item in (CONFIG, other_seed, preset("paper"))}) == 3
