@@ -18,7 +18,7 @@ demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 learned: $(WEIGHTS)  ## the learned point matchers with their weights
 
 test: check $(WEIGHTS)  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
-	$(BIN)/pytest -n 2 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: $(INSTALLED) stubs-are-current no-large-files  ## all that can be said without running the code
 	$(BIN)/ruff format --check .

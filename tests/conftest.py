@@ -15,6 +15,11 @@ settings.register_profile("project", deadline=None, max_examples=30)
 settings.load_profile("project")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Slow tests first: at the end one worker would wait for them while the other has no work."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """Recordings that are not part of the repository; tests that need them skip without."""

@@ -185,7 +185,8 @@ class OpenUploads:
         try:
             yield
         finally:
-            if self._uploads[target] is entry:
+            # The upload that replaced this one may have ended before it.
+            if self._uploads.get(target) is entry:
                 del self._uploads[target]
 
 

@@ -13,7 +13,7 @@ from roel_service.mapping.joint import _Problem, _State, refine_jointly
 from roel_service.mapping.pose_correction import PoseCorrection
 from roel_service.mapping.refine import OrthonormalLines, refine_lines
 
-from .synthetic import line_errors, perturbed, trajectory, world
+from .synthetic import line_errors, observed, perturbed, trajectory, world
 
 INTERVAL_US = 200_000
 # Poses that may be anywhere, and exact observations.
@@ -45,6 +45,7 @@ def seen(world, wrong=None):
         frames=frames,
         observations=world.observations,
         evidence=world.evidence(CONFIG),
+        pieces=observed(),
         images={},
     )
 

@@ -161,3 +161,15 @@ def test_an_upload_that_was_replaced_leaves_the_place_of_the_other():
         pass
     second.__exit__(None, None, None)
     assert ended == [writer_replaced("walk").reason]
+
+
+def test_an_upload_may_end_after_the_one_that_replaced_it():
+    class Ending:
+        def end(self, error):
+            self.error = error
+
+    uploads = OpenUploads(1)
+    with uploads.entered("walk", 1, Ending()), uploads.entered("walk", 2, Ending()):
+        pass
+    with uploads.entered("run", 1, Ending()):
+        pass
