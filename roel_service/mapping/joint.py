@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, sparse
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RefineConfig
@@ -230,12 +230,16 @@ class _Problem:
             weight,
             False,
         )
+        return float(cost.sum()) + self._prior_cost(state)
+
+    def _prior_cost(self, state: _State) -> float:
+        """Of directions and drift."""
         control = state.correction.control.ravel()
-        total = float(cost.sum()) + float(control @ self.drift @ control)
+        cost = float(control @ self.drift @ control)
         if self.directions is not None:
             held = direction_system(state.lines, self.directions)
-            total += self.precision * float(held.cost.sum())
-        return total
+            cost += self.precision * float(held.cost.sum())
+        return cost
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Normal equations with fixed (S,) weights."""
@@ -255,26 +259,26 @@ class _Problem:
             self.forms,
             weight,
         )
-        control = state.correction.control.ravel()
-        total = float(cost.sum()) + float(control @ self.drift @ control)
         if self.directions is not None:
             held = direction_system(state.lines, self.directions)
-            total += self.precision * float(held.cost.sum())
             by_line = by_line + self.precision * held.gradient
             by_lines = by_lines + self.precision * held.hessian
         by_tangent = self._pose_by_tangent(state)
         by_pose = np.einsum("nij,ni->nj", by_tangent, by_pose)
         by_poses = np.swapaxes(by_tangent, -1, -2) @ by_poses @ by_tangent
         rows = rows @ by_tangent[self.frame_of[self.observation]]
-        size = 6 * len(state.correction)
-        spread = np.einsum("nk,nij->nkij", self.shares, by_poses)
-        hessian = np.tensordot(spread, self.shares, axes=(0, 0)).transpose(0, 1, 3, 2)
+        # Of the control points; a frame depends on four of them, so nothing large is dense.
+        control_by_frame = sparse.kron(self.shares, np.eye(6), format="csr")
+        frame_count = len(by_poses)
+        blocks = sparse.bsr_array((by_poses, np.arange(frame_count), np.arange(frame_count + 1)))
+        hessian = (control_by_frame.T @ blocks @ control_by_frame).toarray()
         return _System(
-            cost=total,
+            cost=float(cost.sum()) + self._prior_cost(state),
             line_gradient=by_line,
             line_hessian=by_lines,
-            control_gradient=(self.shares.T @ by_pose).ravel() + self.drift @ control,
-            control_hessian=hessian.reshape(size, size) + self.drift,
+            control_gradient=control_by_frame.T @ by_pose.ravel()
+            + self.drift @ state.correction.control.ravel(),
+            control_hessian=hessian + self.drift,
             rows=rows,
         )
 

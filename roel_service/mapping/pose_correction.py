@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from roel_service.arrays import FloatArray, IntArray, frozen_array
 from roel_service.config.stages import RefineConfig
@@ -75,12 +76,12 @@ class PoseCorrection:
         powers = (position - first)[:, None] ** np.arange(ORDER)
         return first, powers @ BASIS.T
 
-    def shares(self, t_us: IntArray) -> FloatArray:
-        """(N, K) share of every control point at (N,) times."""
+    def shares(self, t_us: IntArray) -> sparse.csr_array:
+        """(N, K) share of every control point at (N,) times, all but four of a row zero."""
         first, basis = self.basis(t_us)
-        shares = np.zeros((len(first), len(self)))
-        np.put_along_axis(shares, first[:, None] + np.arange(ORDER), basis, axis=1)
-        return shares
+        columns = first[:, None] + np.arange(ORDER)
+        ends = np.arange(len(first) + 1) * ORDER
+        return sparse.csr_array((basis.ravel(), columns.ravel(), ends), (len(first), len(self)))
 
     def stepped(self, step: FloatArray) -> PoseCorrection:
         """With other control points: these plus (K, 6)."""

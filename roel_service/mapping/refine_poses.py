@@ -234,6 +234,8 @@ def _covariance(joint: JointlyRefined, trajectory: Trajectory) -> FloatArray:
     count = len(joint.correction)
     covariance = np.linalg.inv(joint.information).reshape(count, 6, count, 6)
     first, basis = joint.correction.basis(trajectory.t_us)
-    near = first[:, None] + np.arange(basis.shape[1])
-    blocks = covariance[near[:, :, None], :, near[:, None, :], :]
-    return np.asarray(np.einsum("na,nb,nabij->nij", basis, basis, blocks))
+    found = np.zeros((len(trajectory), 6, 6))
+    for a, b in np.ndindex(basis.shape[1], basis.shape[1]):
+        share = basis[:, a] * basis[:, b]
+        found += share[:, None, None] * covariance[first + a, :, first + b, :]
+    return found
