@@ -52,13 +52,14 @@ class BuiltMap:
 
     Attributes:
         rlm_bytes: the map file.
-        line_map: the lines as the file holds them.
+        line_map, provenance: as the file holds them.
         trajectory: the poses of the map; those that were given unless they were refined.
         report: with the keys that `roel map build` prints.
     """
 
     rlm_bytes: bytes
     line_map: LineMap
+    provenance: Provenance
     trajectory: Trajectory
     report: Report
 
@@ -114,8 +115,14 @@ def build_map(
             camera_sha256=camera_digest(camera),
         )
         rlm_bytes = encode_map(line_map, provenance)
-        packed = decode_map(rlm_bytes).line_map
-        return BuiltMap(rlm_bytes=rlm_bytes, line_map=packed, trajectory=trajectory, report=report)
+        packed = decode_map(rlm_bytes)
+        return BuiltMap(
+            rlm_bytes=rlm_bytes,
+            line_map=packed.line_map,
+            provenance=packed.provenance,
+            trajectory=trajectory,
+            report=report,
+        )
 
     def tell_preview(line_map: LineMap) -> None:
         if on_preview is None or len(line_map) < MIN_LINE_COUNT:
@@ -177,13 +184,12 @@ def versions() -> dict[str, str]:
 
 
 def _version(built: BuiltMap) -> BuiltVersion:
-    ends = built.line_map.segments.reshape(-1, 3)
     return BuiltVersion(
         rlm_bytes=built.rlm_bytes,
         line_count=len(built.line_map),
-        bounds_m=[*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()],
+        bounds_m=built.line_map.bounds_m.ravel().tolist(),
         report=built.report,
-        provenance=asdict(decode_map(built.rlm_bytes).provenance),
+        provenance=asdict(built.provenance),
     )
 
 

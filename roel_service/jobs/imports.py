@@ -11,7 +11,7 @@ from roel_service.jobs.task import Tell
 from roel_service.progress import Progress
 from roel_service.store.builds import BuiltVersion
 from roel_service.wire.provenance import Provenance
-from roel_service.wire.rlm import RLM_MAGIC, MapFile, decode_map, encode_map
+from roel_service.wire.rlm import RLM_MAGIC, decode_map, encode_map
 
 STAGE = "import"
 
@@ -46,7 +46,7 @@ def run_import(parameters: ImportParameters, tell: Tell) -> BuiltVersion:
     return BuiltVersion(
         rlm_bytes=rlm_bytes,
         line_count=len(map_file.line_map),
-        bounds_m=_bounds_m(map_file),
+        bounds_m=map_file.line_map.bounds_m.ravel().tolist(),
         report={},
         provenance=asdict(map_file.provenance),
         imported_file={
@@ -66,8 +66,3 @@ def _rlm_bytes(file: Path) -> tuple[str, bytes]:
         return "rlm", file.read_bytes()
     name, line_map = read_foreign_map(file, SUBJECT)
     return name, encode_map(line_map, Provenance())
-
-
-def _bounds_m(map_file: MapFile) -> list[float]:
-    ends = map_file.line_map.segments.reshape(-1, 3)
-    return [*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist()]

@@ -199,6 +199,12 @@ class LineMap:
         """(L,) segment lengths."""
         return np.asarray(np.linalg.norm(self.segments[:, 1] - self.segments[:, 0], axis=1))
 
+    @property
+    def bounds_m(self) -> FloatArray:
+        """(2, 3) lower and upper corner of the box around all ends; not of an empty map."""
+        ends = self.segments.reshape(-1, 3)
+        return np.stack([ends.min(axis=0), ends.max(axis=0)])
+
     def transformed(self, T_b_a: SE3) -> LineMap:
         """The same map in frame b, given in frame a."""
         return LineMap(

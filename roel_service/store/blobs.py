@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from roel_service.errors import CorruptionError
+from roel_service.errors import CorruptionError, NotFoundError
 from roel_service.failpoints import failpoint
 from roel_service.store.files import make_folder, sync_file, sync_folder
 
@@ -44,6 +44,11 @@ class BlobStore:
     def path(self, sha256: str) -> Path:
         """Where a blob is, or would be."""
         return self._folder / sha256[:2] / sha256[2:4] / sha256
+
+    def require(self, sha256: str) -> None:
+        """Raise `NotFoundError` unless the blob is there."""
+        if not self.path(sha256).exists():
+            raise NotFoundError("blob", "an uploaded one", sha256)
 
     def put(self, data: bytes) -> str:
         """Store bytes durably; the digest that names them."""

@@ -8,7 +8,6 @@ from typing import Any
 
 from sqlalchemy import Connection, insert, update
 
-from roel_service.errors import NotFoundError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.event_streams import get_mappable
@@ -122,8 +121,7 @@ class Builds:
 
         def act(connection: Connection) -> OperationRecord:
             version = get_map(connection, map_id).version_count + 1
-            if not self._blobs.path(file.sha256).exists():
-                raise NotFoundError("blob", "an uploaded one", file.sha256)
+            self._blobs.require(file.sha256)
             operation = queued_operation(
                 OperationMethod.IMPORT_MAP,
                 request_sha256=request_sha256,

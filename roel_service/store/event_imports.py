@@ -9,7 +9,6 @@ from typing import Any
 
 from sqlalchemy import Connection, insert
 
-from roel_service.errors import NotFoundError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.event_streams import (
@@ -66,8 +65,7 @@ class EventImports:
         """
 
         def act(connection: Connection) -> OperationRecord:
-            if not self._blobs.path(sha256).exists():
-                raise NotFoundError("blob", "an uploaded one", sha256)
+            self._blobs.require(sha256)
             record = begin_filling(connection, stream_id)
             operation = queued_operation(
                 OperationMethod.IMPORT_EVENT_STREAM,
