@@ -57,6 +57,9 @@ JPEG_QUALITY = 92
 # Events are handed on in pieces of at least this many.
 PIECE_EVENT_COUNT = 500_000
 STAGES = ("events", "edges", "cloud", "panoramas")
+# What draws from a stream of chance of its own, in this order, and what of it makes a walk.
+PRODUCTS = ("scene", "motion", "odometry", "events", "cloud", "panoramas")
+OF_THE_WALK = ("motion", "odometry", "events")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +76,8 @@ class SimulationConfig:
             round things.
         mesh: a textured mesh of the user's; takes the place of the scene.
         sensor: thresholds and noise.
+        trajectory_seed: takes the place of the seed for motion, odometry and noise of the sensor:
+            another walk through the same scene; None is the walk of the seed itself.
 
     Raises:
         ConfigError: a value out of range.
@@ -87,6 +92,7 @@ class SimulationConfig:
     scene: str = "room"
     mesh: Path | None = None
     sensor: SensorModel = field(default_factory=SensorModel)
+    trajectory_seed: int | None = None
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -161,12 +167,10 @@ class _Recording:
     def __init__(self, config: SimulationConfig, seed: int, progress: ProgressCallback) -> None:
         self.config = config
         self.progress = progress
-        chance = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(6)]
-        self.rng = dict(
-            zip(
-                ("scene", "motion", "odometry", "events", "cloud", "panoramas"), chance, strict=True
-            )
-        )
+        self.rng = _streams_of_chance(seed)
+        if config.trajectory_seed is not None:
+            walk = _streams_of_chance(config.trajectory_seed)
+            self.rng |= {name: walk[name] for name in OF_THE_WALK}
         self.scene = _scene(config, self.rng["scene"])
         self.scale = float(np.ptp(self.scene.bounds_m, axis=0).max()) / ROOM_SIDE_M
         self.outside = config.mesh is None and config.scene == "cube"
@@ -288,6 +292,11 @@ class _Recording:
                 turn = turn @ rotation_from_vector(np.append(tilt_rad, 0.0))
             poses.append(SE3(rotation=turn, translation=place))
         return poses
+
+
+def _streams_of_chance(seed: int) -> dict[str, np.random.Generator]:
+    children = np.random.SeedSequence(seed).spawn(len(PRODUCTS))
+    return dict(zip(PRODUCTS, map(np.random.default_rng, children), strict=True))
 
 
 class _Counter:

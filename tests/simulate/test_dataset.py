@@ -68,6 +68,16 @@ def test_equal_arguments_give_equal_bytes(made, tmp_path):
     assert contents(tmp_path / "same") == contents(folder)
 
 
+def test_another_trajectory_seed_walks_through_the_same_scene(made, tmp_path):
+    folder, _, _ = made
+    simulate_dataset(tmp_path / "second", replace(SMALL, trajectory_seed=9), 3)
+    first, second = (np.load(path / "gt.npz") for path in (folder, tmp_path / "second"))
+    np.testing.assert_array_equal(first["triangles"], second["triangles"])
+    walks = [read_trajectory(path / "poses.txt") for path in (folder, tmp_path / "second")]
+    apart_m = walks[0].T_world_camera.translation - walks[1].T_world_camera.translation
+    assert np.linalg.norm(apart_m, axis=1).min() > 0.05
+
+
 def test_another_seed_gives_another_recording_in_a_folder_that_was_empty(made, tmp_path):
     folder, _, _ = made
     (tmp_path / "other").mkdir()

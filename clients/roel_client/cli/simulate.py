@@ -27,6 +27,12 @@ def add_commands(subparsers: Subparsers) -> None:
         help="horizontal field of view",
     )
     parser.add_argument("--panoramas", dest="panorama_count", type=integer(0, 999), metavar="N")
+    parser.add_argument(
+        "--trajectory-seed",
+        type=integer(0),
+        metavar="N",
+        help="another walk through the scene of --seed",
+    )
     scene = parser.add_mutually_exclusive_group()
     scene.add_argument(
         "--scene",
@@ -41,7 +47,15 @@ def simulate(options: argparse.Namespace, staged: Staged) -> None:
     """Render a scene along a trajectory and write what the sensor would have sent."""
     from roel_client import local
 
-    names = ("seconds", "width", "height", "fov_deg", "panorama_count", "scene")
+    names = (
+        "seconds",
+        "width",
+        "height",
+        "fov_deg",
+        "panorama_count",
+        "trajectory_seed",
+        "scene",
+    )
     given = {name: value for name in names if (value := getattr(options, name)) is not None}
     if options.mesh is not None:
         given["mesh"] = Path(options.mesh)
