@@ -290,19 +290,19 @@ def _registration_document(result: RegistrationResult, seconds: float) -> dict[s
 
 
 def localize_panoramas(
-    name: str,
+    names: list[str],
     panorama_names: list[str],
     *,
     prior: str | None,
     config: LocalizeConfig,
     overlay: Path | None,
 ) -> Iterator[dict[str, Any]]:
-    """Locate panoramas in a map; for each the keys of `roel localize`.
+    """Locate panoramas in one of a few maps; for each the keys of `roel localize`.
 
     Every file is read once before the first panorama is located.
 
     Args:
-        name: of the map.
+        names: of the maps.
         panorama_names: files.
         prior: file with the first T_world_panorama.
         config: parameters.
@@ -311,42 +311,49 @@ def localize_panoramas(
     from roel_service.evaluation.panorama_figures import draw_overlay
     from roel_service.io.images import read_panorama
     from roel_service.io.transforms import read_transform
+    from roel_service.pano_loc.hints import PosePrior
     from roel_service.pano_loc.localize import localize_panorama
     from roel_service.pano_loc.prepare import prepare_map
 
-    line_map = _read_map(name)
-    T_prior = None if prior is None else read_transform(Path(prior))
+    line_maps = [_read_map(name) for name in names]
+    first = None if prior is None else PosePrior(T_world_picture=read_transform(Path(prior)))
     for panorama_name in panorama_names:
         read_panorama(Path(panorama_name))
-    prepared = prepare_map(line_map, config)
+    maps = [prepare_map(line_map, config) for line_map in line_maps]
     if overlay is not None:
         overlay.mkdir()
     for index, panorama_name in enumerate(panorama_names):
         grey = read_panorama(Path(panorama_name))
         started_s = time.perf_counter()
-        result = localize_panorama(grey, prepared, config, prior=T_prior)
+        result = localize_panorama(grey, maps, config, prior=first)
         seconds = time.perf_counter() - started_s
         if overlay is not None:
             path = overlay / f"{index:03d}-{Path(panorama_name).stem}.png"
-            draw_overlay(grey, line_map, result.T_world_panorama, path)
-        yield _localization_document(panorama_name, result, seconds)
+            best = result.hypotheses[0].map_index if result.hypotheses else 0
+            draw_overlay(grey, line_maps[best], result.T_world_panorama, path)
+        yield _localization_document(panorama_name, names, result, seconds)
 
 
-def _localization_document(name: str, result: PanoLocResult, seconds: float) -> dict[str, Any]:
+def _localization_document(
+    name: str, map_names: list[str], result: PanoLocResult, seconds: float
+) -> dict[str, Any]:
+    several = len(map_names) > 1
     poses = [
         {"T_world_panorama": item.T_world_panorama.matrix().tolist(), "score": item.score}
+        | ({"map": map_names[item.map_index]} if several else {})
         for item in result.hypotheses
     ]
+    best = poses[0] if poses else {"T_world_panorama": None}
     return {
         "panorama": name,
         "status": result.status.value,
-        "T_world_panorama": poses[0]["T_world_panorama"] if poses else None,
+        **best,
         "score": result.score,
         "covariance": result.hypotheses[0].covariance.tolist() if poses else None,
         "alternatives": poses[1:],
         "reason": None if result.reason is None else result.reason.value,
         "seconds": seconds,
-    }
+    } | ({"map": best.get("map")} if several else {})
 
 
 def simulate(folder: Path, seed: int, progress: ProgressCallback, **given: Any) -> int:

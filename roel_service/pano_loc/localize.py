@@ -1,41 +1,81 @@
-"""Where in a map a panorama was taken."""
+"""Where in one of a few maps a picture was taken."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from roel_service.arrays import Array
 from roel_service.config.stages import LocalizeConfig
-from roel_service.geometry.se3 import SE3
+from roel_service.errors import InputError
 from roel_service.pano_loc.arcs import PanoramaArcs, detect_arcs
+from roel_service.pano_loc.hints import Gravity, PosePrior
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import refine_poses
 from roel_service.pano_loc.search import coarse_candidates, rotation_hypotheses
-from roel_service.pano_loc.verdict import enough_lines, judge, no_answer
-from roel_service.scene.results import NoPoseReason, PanoLocResult
+from roel_service.pano_loc.verdict import Found, enough_arcs, enough_lines, hypotheses, judge
+from roel_service.scene.results import PanoLocResult
+
+MAX_MAP_COUNT = 8
 
 
 def localize_panorama(
-    grey: Array, prepared: PreparedMap, config: LocalizeConfig, *, prior: SE3 | None = None
+    grey: Array,
+    maps: Sequence[PreparedMap],
+    config: LocalizeConfig,
+    *,
+    prior: PosePrior | None = None,
+    gravity: Gravity | None = None,
 ) -> PanoLocResult:
     """Where an (H, 2H) uint8 panorama was taken.
 
     Args:
         grey: the picture; x forward at its centre, y left, z up.
-        prepared: the map.
-        config: parameters, the same as the map was prepared with.
-        prior: first T_world_panorama; the search stays within 1 m and 30 degrees of it.
+        maps: 1 to 8, any of which may hold the place.
+        config: parameters, the same as the maps were prepared with.
+        prior: first pose; the search stays within its reach, in every map.
+        gravity: which way is up; orientations that disagree are not tried.
+
+    Raises:
+        InputError: no map, or more than 8.
     """
-    return localize_arcs(detect_arcs(grey, config), prepared, config, prior=prior)
+    return localize_arcs(detect_arcs(grey, config), maps, config, prior=prior, gravity=gravity)
 
 
 def localize_arcs(
-    arcs: PanoramaArcs, prepared: PreparedMap, config: LocalizeConfig, *, prior: SE3 | None = None
+    arcs: PanoramaArcs,
+    maps: Sequence[PreparedMap],
+    config: LocalizeConfig,
+    *,
+    prior: PosePrior | None = None,
+    gravity: Gravity | None = None,
 ) -> PanoLocResult:
     """The same for lines that were found before."""
-    if not enough_lines(arcs, prepared):
-        return no_answer(NoPoseReason.INSUFFICIENT_LINES, arcs)
-    rotations = rotation_hypotheses(arcs, prepared, config, prior)
+    if not 1 <= len(maps) <= MAX_MAP_COUNT:
+        raise InputError("maps", f"1 to {MAX_MAP_COUNT} maps", f"{len(maps)}")
+    found = [
+        _searched(arcs, prepared, index, config, prior, gravity)
+        for index, prepared in enumerate(maps)
+        if enough_arcs(arcs) and enough_lines(prepared)
+    ]
+    return judge(found, arcs, config)
+
+
+def _searched(
+    arcs: PanoramaArcs,
+    prepared: PreparedMap,
+    map_index: int,
+    config: LocalizeConfig,
+    prior: PosePrior | None,
+    gravity: Gravity | None,
+) -> Found:
+    """The best poses in one map."""
+    rotations = rotation_hypotheses(arcs, prepared, config, prior, gravity)
     if len(rotations) == 0:
-        return no_answer(NoPoseReason.DEGENERATE, arcs)
+        return Found(hypotheses=(), rotation_count=0, candidate_count=0)
     candidates = coarse_candidates(arcs, prepared, rotations, config, prior)
     refined = refine_poses(candidates, arcs, prepared, config)
-    return judge(refined, arcs, prepared, len(rotations), config)
+    return Found(
+        hypotheses=hypotheses(refined, arcs, prepared, map_index),
+        rotation_count=len(rotations),
+        candidate_count=len(candidates),
+    )

@@ -6,7 +6,11 @@ map lies in the world.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +34,12 @@ SAMPLE_SPACING_M = 0.05
 MAX_PLACE_COUNT = 4000
 # Shorter lines are more noise than line.
 MIN_LINE_M = 0.05
+
+
+# Grows with every change of what is prepared.
+PREPARATION_VERSION = 1
+
+Arrays = Mapping[str, Array]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,9 +75,26 @@ class PreparedMap:
     def channel_count(self) -> int:
         return min(len(self.shared), MAX_CHANNEL_COUNT)
 
+    def to_arrays(self) -> Arrays:
+        """For keeping it; under a name that `preparation_key` gives."""
+        return {name: np.asarray(value) for name, value in vars(self).items()}
+
+    @staticmethod
+    def from_arrays(arrays: Arrays) -> PreparedMap:
+        """The inverse."""
+        values: dict[str, Any] = dict(arrays)
+        return PreparedMap(**values | {"step_m": float(values["step_m"])})
+
     def fields_at(self, places: FloatArray) -> Array:
         """(T, Q, K) fields of other places."""
         return map_fields(self.segments, self.channel, self.channel_count, places, self.rays)
+
+
+def preparation_key(map_digest: str, config: LocalizeConfig) -> str:
+    """Names the preparation of a map: equal keys, equal arrays."""
+    parameters = json.dumps(asdict(config), sort_keys=True)
+    text = f"{map_digest} {PREPARATION_VERSION} {parameters}"
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:

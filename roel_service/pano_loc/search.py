@@ -13,6 +13,7 @@ from roel_service.geometry.vectors import any_normal, unit
 from roel_service.pano_loc import fields_kernels
 from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.directions import vanishing_directions
+from roel_service.pano_loc.hints import Gravity, PosePrior
 from roel_service.pano_loc.prepare import PreparedMap
 
 # Angles between directions agree this closely when one pair may be the other.
@@ -30,8 +31,7 @@ MIN_EXPLAINED_SHARE = 0.6
 REFINE_WIDTHS_RAD = np.deg2rad([4.0, 3.0, 2.0, 1.5, 1.0, 1.0])
 # Around a single direction every orientation is tried in such steps.
 TURN_STEP_RAD = np.deg2rad(4.0)
-# A prior is trusted so far, and places within its reach are tried at this spacing.
-PRIOR_REACH_M, PRIOR_REACH_RAD = 1.0, np.deg2rad(30.0)
+# Places within reach of a prior are tried at this spacing.
 PRIOR_STEP_M = 0.25
 # Fields agree where they differ by no more steps (about 5 degrees).
 AGREEMENT_STEPS = 6
@@ -66,7 +66,11 @@ class Candidates:
 
 
 def rotation_hypotheses(
-    arcs: PanoramaArcs, prepared: PreparedMap, config: LocalizeConfig, prior: SE3 | None = None
+    arcs: PanoramaArcs,
+    prepared: PreparedMap,
+    config: LocalizeConfig,
+    prior: PosePrior | None = None,
+    gravity: Gravity | None = None,
 ) -> FloatArray:
     """(R, 3, 3) rotations R_world_panorama that lay the picture's directions on the map's.
 
@@ -77,9 +81,11 @@ def rotation_hypotheses(
     if len(rotations) == 0:
         rotations = _aligned_singles(seen, prepared.shared)
     if prior is not None:
-        turned_rad = rotation_angle(rotations @ prior.rotation.T)
-        near = rotations[turned_rad < PRIOR_REACH_RAD]
-        rotations = np.concatenate([near, prior.rotation[None]])
+        first = prior.T_world_picture.rotation
+        near = rotations[rotation_angle(rotations @ first.T) < prior.reach_rad]
+        rotations = np.concatenate([near, first[None]])
+    if gravity is not None:
+        rotations = rotations[gravity.agrees(rotations)]
     if len(rotations) == 0:
         return rotations
     few = arcs.take(np.arange(min(len(arcs), SCORED_ARC_COUNT)))
@@ -177,7 +183,7 @@ def coarse_candidates(
     prepared: PreparedMap,
     rotations: FloatArray,
     config: LocalizeConfig,
-    prior: SE3 | None = None,
+    prior: PosePrior | None = None,
 ) -> Candidates:
     """The best places for every rotation, and of these the best of all.
 
@@ -185,7 +191,7 @@ def coarse_candidates(
     """
     places, fields = prepared.places, prepared.fields
     if prior is not None:
-        places = _ball(PRIOR_REACH_M, PRIOR_STEP_M) + prior.translation
+        places = _ball(prior.reach_m, PRIOR_STEP_M) + prior.T_world_picture.translation
         fields = prepared.fields_at(places)
     chosen_rotation, chosen_place, scores = [], [], []
     for index, rotation in enumerate(rotations):

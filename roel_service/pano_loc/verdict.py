@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from roel_service.arrays import FloatArray
@@ -46,41 +49,56 @@ INDEPENDENT_RAD = np.deg2rad(20.0)
 FLOOR_RAD, FLOOR_M = np.deg2rad(0.02), 1e-3
 
 
-def enough_lines(arcs: PanoramaArcs, prepared: PreparedMap) -> bool:
-    """Whether picture and map have the lines that an answer needs."""
-    seen = len(arcs) >= MIN_ARC_COUNT and arcs.length_rad.sum() >= MIN_ARC_TOTAL_RAD
-    return bool(seen and len(prepared) >= MIN_LINE_COUNT and len(prepared.places))
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Found:
+    """What the search brought out of one map.
+
+    Attributes:
+        hypotheses: in no order.
+        rotation_count, candidate_count: orientations and poses that were tried.
+    """
+
+    hypotheses: tuple[PoseHypothesis, ...]
+    rotation_count: int
+    candidate_count: int
 
 
-def no_answer(reason: NoPoseReason, arcs: PanoramaArcs) -> PanoLocResult:
-    """The result without a search."""
-    return PanoLocResult(
-        status=LocalizationStatus.NOT_FOUND,
-        reason=reason,
-        hypotheses=(),
-        score=0.0,
-        margin=0.0,
-        arc_count=len(arcs),
-        rotation_count=0,
+def enough_arcs(arcs: PanoramaArcs) -> bool:
+    """Whether a picture has the lines that an answer needs."""
+    return len(arcs) >= MIN_ARC_COUNT and bool(arcs.length_rad.sum() >= MIN_ARC_TOTAL_RAD)
+
+
+def enough_lines(prepared: PreparedMap) -> bool:
+    """Whether a map has."""
+    return len(prepared) >= MIN_LINE_COUNT and len(prepared.places) > 0
+
+
+def hypotheses(
+    candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, map_index: int
+) -> tuple[PoseHypothesis, ...]:
+    """The candidates, weighed in both directions."""
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
+    return tuple(
+        _hypothesis(candidates.poses[index], arcs, samples, prepared, map_index)
+        for index in range(len(candidates))
     )
 
 
-def judge(
-    candidates: Candidates,
-    arcs: PanoramaArcs,
-    prepared: PreparedMap,
-    rotation_count: int,
-    config: LocalizeConfig,
-) -> PanoLocResult:
-    """The candidates, weighed in both directions, and the status of the best."""
-    samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    found = [
-        _hypothesis(candidates.poses[index], arcs, samples, prepared)
-        for index in range(len(candidates))
-    ]
-    found.sort(key=lambda item: -item.score)
-    margin = _margin(found)
-    reason = _reason(found[0], margin, config)
+def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig) -> PanoLocResult:
+    """The best poses of all maps, and the status of the best.
+
+    Args:
+        searched: one for each map that was searched; none if picture or maps had too few lines.
+    """
+    found = [item for one in searched for item in one.hypotheses]
+    found = sorted(found, key=lambda item: -item.score)[: config.max_hypothesis_count]
+    margin = _margin(found) if found else 0.0
+    if not searched:
+        reason: NoPoseReason | None = NoPoseReason.INSUFFICIENT_LINES
+    elif not found:
+        reason = NoPoseReason.DEGENERATE
+    else:
+        reason = _reason(found[0], margin, config)
     status = {
         None: LocalizationStatus.FOUND,
         NoPoseReason.AMBIGUOUS: LocalizationStatus.AMBIGUOUS,
@@ -89,10 +107,11 @@ def judge(
         status=status,
         reason=reason,
         hypotheses=() if status is LocalizationStatus.NOT_FOUND else tuple(found),
-        score=found[0].score,
+        score=found[0].score if found else 0.0,
         margin=margin,
         arc_count=len(arcs),
-        rotation_count=rotation_count,
+        rotation_count=sum(one.rotation_count for one in searched),
+        candidate_count=sum(one.candidate_count for one in searched),
     )
 
 
@@ -117,7 +136,9 @@ def _margin(found: list[PoseHypothesis]) -> float:
 
 
 def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
-    """Whether two poses are within what `FOUND` promises."""
+    """Whether two poses are within what `FOUND` promises; places in different maps never are."""
+    if a.map_index != b.map_index:
+        return False
     T_a, T_b = a.T_world_panorama, b.T_world_panorama
     turn_rad = rotation_angle(T_a.rotation @ T_b.rotation.T)
     shift_m = np.linalg.norm(T_a.translation - T_b.translation)
@@ -125,7 +146,7 @@ def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
 
 
 def _hypothesis(
-    pose: SE3, arcs: PanoramaArcs, samples: Samples, prepared: PreparedMap
+    pose: SE3, arcs: PanoramaArcs, samples: Samples, prepared: PreparedMap, map_index: int
 ) -> PoseHypothesis:
     explained_2d = explained(pose, samples, prepared)
     explained_3d = covered(pose, arcs, prepared)
@@ -136,6 +157,7 @@ def _hypothesis(
         covariance=_covariance(pose, samples, prepared),
         explained_2d=explained_2d,
         explained_3d=explained_3d,
+        map_index=map_index,
     )
 
 

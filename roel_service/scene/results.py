@@ -201,6 +201,7 @@ class PoseHypothesis:
         covariance: (6, 6) of (r, d), rad and m, world.
         explained_2d: share of the picture's lines that the map explains, 0 to 1.
         explained_3d: share of the map's lines in view that the picture explains, 0 to 1.
+        map_index: which of the maps that were asked it is in.
     """
 
     T_world_panorama: SE3
@@ -208,6 +209,7 @@ class PoseHypothesis:
     covariance: FloatArray
     explained_2d: float
     explained_3d: float
+    map_index: int = 0
 
     def __post_init__(self) -> None:
         covariance = frozen_array(self.covariance, np.float64, (6, 6), "covariance")
@@ -225,7 +227,8 @@ class PanoLocResult:
         score: that of the best pose, in the map or not.
         margin: how far, as a share of the best score, the best pose elsewhere falls behind.
         arc_count: lines in the picture.
-        rotation_count: orientations that were tried.
+        rotation_count: orientations that were tried, in all maps.
+        candidate_count: poses that were tried, in all maps.
     """
 
     status: LocalizationStatus
@@ -235,6 +238,7 @@ class PanoLocResult:
     margin: float
     arc_count: int
     rotation_count: int
+    candidate_count: int
 
     @property
     def T_world_panorama(self) -> SE3 | None:

@@ -17,7 +17,7 @@ from roel_service.errors import NoAnswerError
 from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
 from roel_service.geometry.se3 import SE3
 from roel_service.io.maps import export_map
-from tests.pano_loc.rooms import map_of, pose, segments_of
+from tests.pano_loc.rooms import OTHER_FURNITURE, OTHER_ROOM, map_of, pose, segments_of
 from tests.pano_loc.wireframe import wireframe_panorama
 
 ROEL = Path(sys.executable).with_name("roel")
@@ -103,6 +103,17 @@ def test_strict_ends_with_3_and_still_prints_the_results(folder):
     (line,) = done.stderr.splitlines()
     assert line.startswith("roel: no answer: black.jpg: ")
     assert "INSUFFICIENT_LINES" in line
+
+
+def test_the_map_that_holds_the_place_is_named(folder, monkeypatch, capsys):
+    export_map(map_of(OTHER_ROOM, OTHER_FURNITURE), folder / "other.npz")
+    monkeypatch.chdir(folder)
+    options = ["localize", "other.npz", "room.png", "black.jpg", "--map", "map.npz", "--json"]
+    localize(parser().parse_args(options), {})
+    found, lost = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert set(found) == set(lost) == KEYS | {"map"}
+    assert (found["status"], found["map"]) == ("FOUND", "map.npz")
+    assert (lost["status"], lost["map"]) == ("NOT_FOUND", None)
 
 
 def test_a_prior_is_read_and_the_pose_printed_for_people(folder):

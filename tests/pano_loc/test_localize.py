@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from roel_service.config.stages import LocalizeConfig
+from roel_service.errors import InputError
 from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
 from roel_service.geometry.se3 import SE3
+from roel_service.pano_loc.hints import Gravity, PosePrior
 from roel_service.pano_loc.localize import localize_arcs, localize_panorama
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.scene.lines import LineMap
@@ -43,7 +45,7 @@ def require_pose(result, truth, max_shift_m=0.01, max_turn_deg=0.3):
 
 @pytest.mark.parametrize("truth", POSES)
 def test_a_panorama_of_the_room_is_found_however_it_is_tilted(room, truth):
-    result = localize_arcs(seen_from(truth, segments_of(), noise_rad=NOISE_RAD), room, CONFIG)
+    result = localize_arcs(seen_from(truth, segments_of(), noise_rad=NOISE_RAD), [room], CONFIG)
     require_pose(result, truth)
     covariance = result.hypotheses[0].covariance
     assert (np.linalg.eigvalsh(covariance) > 0).all()
@@ -59,7 +61,7 @@ def test_the_answer_moves_with_the_map(room, motion):
     truth = POSES[1]
     arcs = seen_from(truth, segments_of(), noise_rad=NOISE_RAD)
     moved = prepare_map(map_of(noise_m=0.005).transformed(motion), CONFIG)
-    here, there = localize_arcs(arcs, room, CONFIG), localize_arcs(arcs, moved, CONFIG)
+    here, there = localize_arcs(arcs, [room], CONFIG), localize_arcs(arcs, [moved], CONFIG)
     assert there.status is here.status
     expected = motion @ here.T_world_panorama
     assert translation_errors_m(there.T_world_panorama, expected) < 0.002
@@ -69,13 +71,13 @@ def test_the_answer_moves_with_the_map(room, motion):
 def test_the_answer_turns_with_the_panorama(room):
     turn = pose(0, 0, 0, 0.0, 0.0, 1.1)
     arcs = [seen_from(truth, segments_of(), noise_rad=0.0) for truth in (POSES[0], POSES[0] @ turn)]
-    first, second = (localize_arcs(item, room, CONFIG).T_world_panorama for item in arcs)
+    first, second = (localize_arcs(item, [room], CONFIG).T_world_panorama for item in arcs)
     assert np.degrees(rotation_errors_rad(first @ turn, second)) < 0.1
 
 
 def test_a_panorama_of_another_room_is_not_in_the_map(room):
     segments = segments_of(OTHER_ROOM, OTHER_FURNITURE)
-    result = localize_arcs(seen_from(pose(2.4, 1.2, 1.4, 0, 0, 1.0), segments), room, CONFIG)
+    result = localize_arcs(seen_from(pose(2.4, 1.2, 1.4, 0, 0, 1.0), segments), [room], CONFIG)
     assert result.status is LocalizationStatus.NOT_FOUND
     assert result.reason is NoPoseReason.NOT_IN_MAP
     assert result.hypotheses == ()
@@ -86,7 +88,7 @@ def test_a_room_that_equals_itself_after_half_a_turn_is_ambiguous():
     segments = segments_of(furniture=SYMMETRIC_FURNITURE)
     truth = POSES[0]
     result = localize_arcs(
-        seen_from(truth, segments), prepare_map(LineMap.from_segments(segments), CONFIG), CONFIG
+        seen_from(truth, segments), [prepare_map(LineMap.from_segments(segments), CONFIG)], CONFIG
     )
     assert result.status is LocalizationStatus.AMBIGUOUS
     assert result.reason is NoPoseReason.AMBIGUOUS
@@ -99,28 +101,30 @@ def test_a_room_that_equals_itself_after_half_a_turn_is_ambiguous():
 def test_a_prior_resolves_what_is_ambiguous():
     segments = segments_of(furniture=SYMMETRIC_FURNITURE)
     truth = POSES[0]
-    prior = truth.retract(np.array([0.1, -0.2, 0.3, 0.4, -0.4, 0.3]))
+    first = truth.retract(np.array([0.1, -0.2, 0.3, 0.4, -0.4, 0.3]))
+    prior = PosePrior(T_world_picture=first)
     prepared = prepare_map(LineMap.from_segments(segments), CONFIG)
-    require_pose(localize_arcs(seen_from(truth, segments), prepared, CONFIG, prior=prior), truth)
+    require_pose(localize_arcs(seen_from(truth, segments), [prepared], CONFIG, prior=prior), truth)
 
 
 def test_a_prior_far_from_the_truth_is_not_left(room):
-    prior = SE3(rotation=np.eye(3), translation=np.array([2.0, 1.6, 1.2]))
+    first = SE3(rotation=np.eye(3), translation=np.array([2.0, 1.6, 1.2]))
+    prior = PosePrior(T_world_picture=first)
     arcs = seen_from(pose(1.7, 1.5, 1.4, 0, 0, 2.5), segments_of())
-    result = localize_arcs(arcs, room, CONFIG, prior=prior)
+    result = localize_arcs(arcs, [room], CONFIG, prior=prior)
     assert result.status is LocalizationStatus.NOT_FOUND
 
 
 @pytest.mark.parametrize("count", [0, 5])
 def test_a_map_of_few_lines_says_so(count):
     prepared = prepare_map(LineMap.from_segments(segments_of()[:count]), CONFIG)
-    result = localize_arcs(seen_from(POSES[0], segments_of()), prepared, CONFIG)
+    result = localize_arcs(seen_from(POSES[0], segments_of()), [prepared], CONFIG)
     assert result.status is LocalizationStatus.NOT_FOUND
     assert result.reason is NoPoseReason.INSUFFICIENT_LINES
 
 
 def test_a_black_picture_says_so(room):
-    result = localize_panorama(np.zeros((256, 512), np.uint8), room, CONFIG)
+    result = localize_panorama(np.zeros((256, 512), np.uint8), [room], CONFIG)
     assert result.reason is NoPoseReason.INSUFFICIENT_LINES
 
 
@@ -128,6 +132,39 @@ def test_lines_of_one_direction_leave_the_place_open():
     segments = segments_of()
     upright = segments[np.abs(segments[:, 1, 2] - segments[:, 0, 2]) > 0.3]
     result = localize_arcs(
-        seen_from(POSES[0], upright), prepare_map(LineMap.from_segments(upright), CONFIG), CONFIG
+        seen_from(POSES[0], upright), [prepare_map(LineMap.from_segments(upright), CONFIG)], CONFIG
     )
     assert result.status is not LocalizationStatus.FOUND
+
+
+def test_the_map_that_holds_the_place_is_told(room):
+    other = prepare_map(map_of(OTHER_ROOM, OTHER_FURNITURE, noise_m=0.005), CONFIG)
+    truth = POSES[1]
+    arcs = seen_from(truth, segments_of(), noise_rad=NOISE_RAD)
+    result = localize_arcs(arcs, [other, room], CONFIG)
+    require_pose(result, truth)
+    assert result.hypotheses[0].map_index == 1
+
+
+def test_the_same_map_twice_is_ambiguous(room):
+    arcs = seen_from(POSES[0], segments_of(), noise_rad=NOISE_RAD)
+    result = localize_arcs(arcs, [room, room], CONFIG)
+    assert result.status is LocalizationStatus.AMBIGUOUS
+    assert {item.map_index for item in result.hypotheses[:2]} == {0, 1}
+
+
+@pytest.mark.parametrize("count", [0, 9])
+def test_no_map_and_more_than_eight_are_refused(room, count):
+    with pytest.raises(InputError, match=f"expected 1 to 8 maps, found {count}"):
+        localize_arcs(seen_from(POSES[0], segments_of()), count * [room], CONFIG)
+
+
+def test_gravity_leaves_few_orientations_and_finds_the_same_place(room):
+    truth = POSES[1]
+    up = np.array([0.0, 0.0, 1.0])
+    gravity = Gravity(up_world=up, up_picture=truth.inverse().rotate(up))
+    arcs = seen_from(truth, segments_of(), noise_rad=NOISE_RAD)
+    free = localize_arcs(arcs, [room], CONFIG)
+    result = localize_arcs(arcs, [room], CONFIG, gravity=gravity)
+    require_pose(result, truth)
+    assert result.rotation_count < free.rotation_count / 3

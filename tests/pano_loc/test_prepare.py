@@ -1,10 +1,19 @@
+import io
+
 import numpy as np
 
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry import sphere
 from roel_service.geometry.vectors import angle_between, unit
 from roel_service.pano_loc import fields_kernels
-from roel_service.pano_loc.prepare import MAX_PLACE_COUNT, cube_rays, free_places, prepare_map
+from roel_service.pano_loc.prepare import (
+    MAX_PLACE_COUNT,
+    PreparedMap,
+    cube_rays,
+    free_places,
+    preparation_key,
+    prepare_map,
+)
 from tests.pano_loc.rooms import map_of, segments_of
 
 
@@ -62,3 +71,22 @@ def test_an_empty_map_can_be_prepared():
     prepared = prepare_map(map_of().__class__.from_segments(np.empty((0, 2, 3))), LocalizeConfig())
     assert len(prepared) == 0
     assert len(prepared.places) == 0
+
+
+def test_a_prepared_map_is_kept_as_plain_arrays():
+    prepared = prepare_map(map_of(), LocalizeConfig())
+    file = io.BytesIO()
+    np.savez(file, **prepared.to_arrays())
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as arrays:
+        again = PreparedMap.from_arrays(arrays)
+    for name, value in vars(prepared).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_the_key_of_a_preparation_tells_maps_and_parameters_apart():
+    config = LocalizeConfig()
+    key = preparation_key("sha256:1", config)
+    assert key == preparation_key("sha256:1", LocalizeConfig())
+    assert key != preparation_key("sha256:2", config)
+    assert key != preparation_key("sha256:1", LocalizeConfig(grid_step_m=0.3))

@@ -18,7 +18,9 @@ FOUND = "FOUND"
 def add_commands(subparsers: Subparsers) -> None:
     """Declare `localize`."""
     what = Command(
-        run=localize, inputs=("map", "panoramas", "prior", "config"), folders=("overlay",)
+        run=localize,
+        inputs=("map", "more_maps", "panoramas", "prior", "config"),
+        folders=("overlay",),
     )
     parser = command(subparsers, "localize", "find where panoramas were taken in a map", what)
     parser.add_argument("map", metavar="MAP", help=".rlm file or exported .npz")
@@ -27,6 +29,14 @@ def add_commands(subparsers: Subparsers) -> None:
         metavar="PANO",
         nargs="+",
         help="equirectangular JPEG or PNG, width twice the height",
+    )
+    parser.add_argument(
+        "--map",
+        action="append",
+        default=[],
+        dest="more_maps",
+        metavar="MAP",
+        help="another map that may hold the place, up to seven times",
     )
     parser.add_argument(
         "--prior", metavar="T.txt", help="first T_world_panorama, within 1 m, 30 deg"
@@ -51,7 +61,7 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
     if options.preset == "paper":
         raise UsageError("--preset", "default, the one preset of localization so far", "paper")
     documents: Iterable[dict[str, Any]] = local.localize_panoramas(
-        options.map,
+        [options.map, *options.more_maps],
         options.panoramas,
         prior=options.prior,
         config=effective_config(options).localize,
@@ -81,7 +91,9 @@ def require_found(documents: Iterable[dict[str, Any]]) -> None:
 def told(document: dict[str, Any]) -> str:
     """The pose for people."""
     reason = "" if document["reason"] is None else f" ({document['reason']})"
-    head = f"{document['panorama']}: {document['status']}{reason}, score {document['score']:.2f}"
+    place = f" in {document['map']}" if document.get("map") else ""
+    score = f"score {document['score']:.2f}"
+    head = f"{document['panorama']}: {document['status']}{reason}{place}, {score}"
     rows = [
         " ".join(f"{value:12.9f}" for value in row) for row in document["T_world_panorama"] or []
     ]
