@@ -531,3 +531,48 @@ def bench_registration(
     document = registration.run(places, protocols, progress)
     registration.write_document(path, document)
     return document, registration_report.document(document)
+
+
+def bench_localization(
+    path: Path,
+    *,
+    rooms: list[tuple[str, str]],
+    house: tuple[str, str] | None,
+    symmetric_count: int,
+    protocols: list[str],
+    methods: list[str],
+    max_count: int | None,
+    again: bool,
+    progress: ProgressCallback,
+) -> tuple[dict[str, Any], str]:
+    """Run what the file does not hold of the localization benchmark; the file, and its tables.
+
+    Args:
+        path: JSON file, which an interrupted run goes on with.
+        rooms: pairs of map and folder of panoramas.
+        house: archive of lines with rooms, and folder of photographs.
+        symmetric_count: rooms of boxes to make.
+        protocols, methods: names; all without any.
+        max_count: panoramas of a place at the most.
+        again: run what the file holds, too.
+    """
+    from dataclasses import replace
+
+    from roel_bench import localization, localization_places, localization_report
+
+    places = [
+        localization_places.room(Path(name).stem, _read_map(name), Path(folder))
+        for name, folder in rooms
+    ]
+    if house is not None:
+        places += localization_places.house(Path(house[0]), Path(house[1]))
+    places += localization_places.symmetric_rooms(symmetric_count)
+    chosen = [
+        replace(protocol, max_count=min(protocol.max_count, max_count or protocol.max_count))
+        for protocol in localization.PROTOCOLS
+        if not protocols or protocol.name in protocols
+    ]
+    results = localization.run(
+        places, chosen, localization.find_methods(methods), path, progress, again=again
+    )
+    return localization.to_document(results), localization_report.measured(results)

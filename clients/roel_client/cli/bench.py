@@ -1,4 +1,4 @@
-"""`roel bench mapping` and `roel bench registration`."""
+"""`roel bench`: mapping, registration, localization."""
 
 from __future__ import annotations
 
@@ -18,6 +18,11 @@ from roel_client.cli.parser import (
 )
 from roel_client.cli.staging import Staged
 
+LOCALIZATION_METHODS = ("default",)
+LOCALIZATION_PROTOCOLS = (
+    "here", "moved", "yaw_5", "yaw_17", "elsewhere", "prior", "width_512", "width_1024",
+    "width_4096", "quality_10", "quality_30", "quality_50", "quality_70",
+)  # fmt: skip
 SUITES = ("quick", "presets", "ablation", "noise", "front-end", "peers", "curves", "full")
 
 
@@ -26,6 +31,7 @@ def add_commands(subparsers: Subparsers) -> None:
     group = command_group(subparsers, "bench", "measure how good the results are")
     _add_mapping(group)
     _add_registration(group)
+    _add_localization(group)
 
 
 def _add_mapping(group: Subparsers) -> None:
@@ -108,6 +114,80 @@ def bench_registration(options: argparse.Namespace, staged: Staged) -> None:
             [(line_map, cloud) for line_map, cloud in options.place],
             staged["out"],
             max_count=options.trials,
+            progress=progress,
+        )
+    print_result(document, text.rstrip("\n"), as_json=options.json)
+
+
+def _add_localization(group: Subparsers) -> None:
+    # The file is no staged output: it keeps the cells of an interrupted run, for the next one.
+    what = Command(run=bench_localization)
+    parser = command(group, "localization", "panoramas in maps of their places", what)
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=suffixed(".json"),
+        metavar="FILE.json",
+        help="every trial; what it holds is not run again",
+    )
+    parser.add_argument(
+        "--room",
+        action="append",
+        nargs=2,
+        default=[],
+        metavar=("MAP", "PANOS"),
+        help="a map, and a folder of panoramas of the same room with their poses; may be repeated",
+    )
+    parser.add_argument(
+        "--house",
+        nargs=2,
+        metavar=("LINES.npz", "PANOS"),
+        help="lines of a house with the names of their rooms, and a folder of photographs",
+    )
+    parser.add_argument(
+        "--symmetric",
+        type=integer(0, 1000),
+        default=0,
+        metavar="N",
+        help="so many symmetric rooms of boxes, made by chance",
+    )
+    parser.add_argument(
+        "--protocols",
+        nargs="+",
+        default=[],
+        type=one_of(*LOCALIZATION_PROTOCOLS),
+        metavar="NAME",
+        help=f"only these of {', '.join(LOCALIZATION_PROTOCOLS)}",
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=[],
+        type=one_of(*LOCALIZATION_METHODS),
+        metavar="NAME",
+        help=f"only these of {', '.join(LOCALIZATION_METHODS)}",
+    )
+    parser.add_argument(
+        "--trials", type=integer(1, 1000), metavar="N", help="at most so many of each kind"
+    )
+    parser.add_argument("--again", action="store_true", help="run what the file holds, too")
+    parser.add_argument("--json", action="store_true", help="print all trials as JSON")
+
+
+def bench_localization(options: argparse.Namespace, staged: Staged) -> None:
+    """Run the protocols on all places and print their tables."""
+    from roel_client import local
+
+    with progress_bar() as progress:
+        document, text = local.bench_localization(
+            Path(options.out),
+            rooms=[(line_map, folder) for line_map, folder in options.room],
+            house=tuple(options.house) if options.house else None,
+            symmetric_count=options.symmetric,
+            protocols=options.protocols,
+            methods=options.methods,
+            max_count=options.trials,
+            again=options.again,
             progress=progress,
         )
     print_result(document, text.rstrip("\n"), as_json=options.json)

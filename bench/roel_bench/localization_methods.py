@@ -1,0 +1,69 @@
+"""The methods that locate panoramas, all asked in the same way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from roel_service.arrays import Array, FloatArray
+from roel_service.config.stages import LocalizeConfig
+from roel_service.geometry.se3 import SE3
+from roel_service.pano_loc.localize import localize_panorama
+from roel_service.pano_loc.prepare import prepare_map
+from roel_service.scene.lines import LineMap
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Answer:
+    """What a method says.
+
+    Attributes:
+        status: empty where a method has no verdict.
+        poses: best first; none where a method says so.
+        score, margin: of the best pose, where a method tells.
+        covariance: (6, 6) of the best pose, where a method tells.
+    """
+
+    status: str
+    poses: tuple[SE3, ...]
+    score: float | None = None
+    margin: float | None = None
+    covariance: FloatArray | None = None
+
+
+# Asks a prepared map for an (H, 2H) uint8 picture, with or without a first guess.
+Query = Callable[[Array, SE3 | None], Answer]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Method:
+    """A method by name.
+
+    Attributes:
+        prepare: what is done once for each map.
+    """
+
+    name: str
+    prepare: Callable[[LineMap], Query]
+
+
+def _prepare_default(line_map: LineMap) -> Query:
+    config = LocalizeConfig()
+    prepared = prepare_map(line_map, config)
+
+    def query(grey: Array, prior: SE3 | None) -> Answer:
+        result = localize_panorama(grey, prepared, config, prior=prior)
+        poses = tuple(item.T_world_panorama for item in result.hypotheses)
+        covariance = result.hypotheses[0].covariance if poses else None
+        return Answer(
+            status=result.status.value,
+            poses=poses,
+            score=result.score,
+            margin=result.margin,
+            covariance=covariance,
+        )
+
+    return query
+
+
+METHODS = {method.name: method for method in (Method(name="default", prepare=_prepare_default),)}
