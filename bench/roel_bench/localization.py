@@ -39,9 +39,9 @@ MAX_BYTES = 16 << 20
 # A pose is right within these.
 FINE_M, FINE_DEG = 0.1, 5.0
 COARSE_M, COARSE_DEG = 0.3, 15.0
-PRIOR_TURN_RAD, PRIOR_SHIFT_M = np.radians(30.0), 0.5
+PRIOR_TURN_RAD, PRIOR_SHIFT_M = np.radians(25.0), 0.4
 MOTION_COUNT = 4
-FEW = 6
+FEW, SOME = 3, 8
 
 HERE, MOVED, ELSEWHERE, PRIOR = "here", "moved", "elsewhere", "prior"
 WIDTHS_PX = (512, 1024, 4096)
@@ -153,6 +153,7 @@ PROTOCOLS = (
     Protocol(
         name=MOVED,
         kinds=(ROOM, HOUSE, HOUSE_ROOM),
+        max_count=SOME,
         motions=tuple(
             anywhere(np.random.default_rng(seed), upright=False) for seed in range(MOTION_COUNT)
         ),
@@ -171,8 +172,8 @@ PROTOCOLS = (
         max_count=FEW,
         motions=_yaw(17.0),
     ),
-    Protocol(name=ELSEWHERE, kinds=(ROOM,), methods=("default",)),
-    Protocol(name=PRIOR, kinds=(ROOM,), methods=("default",), has_prior=True),
+    Protocol(name=ELSEWHERE, kinds=(ROOM,), methods=("default",), max_count=SOME),
+    Protocol(name=PRIOR, kinds=(ROOM,), methods=("default",), max_count=SOME, has_prior=True),
     *(
         Protocol(
             name=f"width_{width}",

@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
+from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.localize import localize_panorama
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.scene.lines import LineMap
+
+# A first guess is trusted so far.
+PRIOR_REACH_M, PRIOR_REACH_RAD = 0.5, float(np.radians(30.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -52,7 +58,12 @@ def _prepare_default(line_map: LineMap) -> Query:
     prepared = prepare_map(line_map, config)
 
     def query(grey: Array, prior: SE3 | None) -> Answer:
-        result = localize_panorama(grey, prepared, config, prior=prior)
+        first = (
+            None
+            if prior is None
+            else PosePrior(T_world_picture=prior, reach_m=PRIOR_REACH_M, reach_rad=PRIOR_REACH_RAD)
+        )
+        result = localize_panorama(grey, [prepared], config, prior=first)
         poses = tuple(item.T_world_panorama for item in result.hypotheses)
         covariance = result.hypotheses[0].covariance if poses else None
         return Answer(

@@ -115,7 +115,8 @@ were taken where the layout has no lines.
 """
 
 TIMES = """\
-One query from the decoded picture to the answer; `prior` with a first guess that is 30 degrees and 0.5 m off.
+One query from the decoded picture to the answer; `prior` with a first guess that is 25 degrees and 0.4 m off
+and trusted within 30 degrees and 0.5 m.
 `ratio` is to `fgpl` on the same place in the same run.
 """
 
