@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import FloatArray, IntArray
 from roel_service.geometry.se3 import SE3, rotation_from_vector
-from roel_service.geometry.vectors import any_normal, dot, norm
+from roel_service.geometry.vectors import dot, norm
+from roel_service.register.align_kernels import crease_sums, surface_sums
 from roel_service.register.alignment import Alignment
 from roel_service.register.prepare import PreparedCloud
 from roel_service.register.source import Samples
@@ -25,6 +26,8 @@ GATE_SCALES = 3.0
 POINT_SHARE = 0.1
 # Creases are looked for this near, in distances between points, and have to run alike (cosine).
 CREASE_REACH, CREASE_COSINE, CREASE_COUNT = 1.5, 0.98, 3
+# Samples are paired anew when one has moved by more than this, in scales of the loss.
+REPAIR_SHARE = 0.25
 # Steps shorter than this, rad and m, are no steps.
 SETTLED_STEP = 2e-5
 # Pairs below which nothing can be solved.
@@ -65,16 +68,19 @@ def align(samples: Samples, target: PreparedCloud, start: Alignment, level: Leve
     some = samples.at_most(level.sample_count)
     T, scale = start.T_target_source, start.scale
     scale_m = level.first_scale_m
+    pairs: Pairs | None = None
     for step in range(1, level.step_count + 1):
         is_last_scale = scale_m <= level.last_scale_m
         moved = T @ (scale * some.points)
-        directions = T.rotate(some.directions)
-        equations = Equations(H=np.zeros((7, 7)), g=np.zeros(7), pivot=moved.mean(axis=0))
-        pairs = _pull(equations, moved, directions, some.weights, target, scale_m, level)
-        if pairs < MIN_PAIR_COUNT:
+        if pairs is None or pairs.motion_m(moved) > REPAIR_SHARE * scale_m:
+            pairs = _paired(moved, T.rotate(some.directions), target, scale_m, level)
+        if pairs.count < MIN_PAIR_COUNT:
             return _ended(T, scale, StopReason.NO_OVERLAP, start, step)
+        pivot = moved.mean(axis=0)
+        share = 0.0 if is_last_scale else POINT_SHARE
+        equations = _equations(pairs, moved, some.weights, target, scale_m, share, level, pivot)
         tangent, growth = equations.step(level.estimate_scale)
-        pivot, rotation = equations.pivot, rotation_from_vector(tangent[:3])
+        rotation = rotation_from_vector(tangent[:3])
         T = SE3(
             rotation=rotation @ T.rotation,
             translation=growth * (rotation @ (T.translation - pivot)) + pivot + tangent[3:],
@@ -91,31 +97,41 @@ def _ended(T: SE3, scale: float, reason: StopReason, start: Alignment, steps: in
     return Alignment(T_target_source=T, scale=scale, stop_reason=reason, iteration_count=count)
 
 
-@dataclass(eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pairs:
+    """What each sample is pulled to; -1 for nothing.
+
+    Attributes:
+        moved: (P, 3) m, the samples when they were paired.
+        surfaces: (P,) rows of the surface points.
+        creases: (P,) rows of the creases.
+    """
+
+    moved: FloatArray
+    surfaces: IntArray
+    creases: IntArray
+
+    @property
+    def count(self) -> int:
+        return int((self.surfaces >= 0).sum() + (self.creases >= 0).sum())
+
+    def motion_m(self, moved: FloatArray) -> float:
+        """How far any sample has moved since, along any axis."""
+        return float(np.abs(moved - self.moved).max())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Equations:
     """Normal equations of one step: rotation about a pivot, shift, growth.
 
     Attributes:
         H: (7, 7); g: (7,).
-        pivot: (3,) m, what the samples turn about.
-        squares_m2, weight: weighted sums of the squared distances, and of one.
+        variance_m2: weighted mean of the squared distances.
     """
 
     H: FloatArray
     g: FloatArray
-    pivot: FloatArray
-    squares_m2: float = 0.0
-    weight: float = 0.0
-
-    def add(self, p: FloatArray, n: FloatArray, off_m: FloatArray, weights: FloatArray) -> None:
-        """Samples at p that are off by `off_m` along n: (N, 3), (N, 3), (N,), and their weights."""
-        arm = p - self.pivot
-        J = np.concatenate([_cross(arm, n), n, dot(arm, n)[:, None]], axis=1)
-        weighted = J * weights[:, None]
-        self.H += weighted.T @ J
-        self.g += weighted.T @ off_m
-        self.squares_m2 += float(weights @ off_m**2)
-        self.weight += float(weights.sum())
+    variance_m2: float
 
     def step(self, estimate_scale: bool) -> tuple[FloatArray, float]:
         """(6,) tangent about the pivot, and the factor by which the source grows."""
@@ -136,111 +152,93 @@ def information(alignment: Alignment, samples: Samples, target: PreparedCloud) -
     _, line, sizes = np.unique(samples.group, return_inverse=True, return_counts=True)
     weights = np.minimum(1.0, INDEPENDENT_PER_LINE / sizes[line])
     moved = T @ (alignment.scale * samples.points)
+    scale_m = target.resolution_m
     level = Level(
-        first_scale_m=0.0,
-        last_scale_m=target.resolution_m,
+        first_scale_m=scale_m,
+        last_scale_m=scale_m,
         sample_count=len(samples),
         step_count=0,
         crease_weight=1.0,
     )
+    pairs = _paired(moved, T.rotate(samples.directions), target, scale_m, level)
     # R <- Exp(r) R turns about the translation.
-    equations = Equations(H=np.zeros((7, 7)), g=np.zeros(7), pivot=T.translation)
-    directions = T.rotate(samples.directions)
-    _pull(equations, moved, directions, weights, target, target.resolution_m, level)
-    sigma2_m2 = equations.squares_m2 / max(equations.weight, 1e-9)
-    return np.asarray(equations.H[:6, :6] / max(sigma2_m2, MIN_SIGMA_M**2))
+    equations = _equations(pairs, moved, weights, target, scale_m, 0.0, level, T.translation)
+    return np.asarray(equations.H[:6, :6] / max(equations.variance_m2, MIN_SIGMA_M**2))
 
 
-def _pull(
-    equations: Equations,
+def _paired(
     moved: FloatArray,
     directions: FloatArray,
-    weights: FloatArray,
     target: PreparedCloud,
     scale_m: float,
     level: Level,
-) -> int:
-    """Add the pairs of this moment; answers how many."""
-    count = 0
-    if level.surface_weight > 0.0:
-        share = POINT_SHARE if scale_m > level.last_scale_m else 0.0
-        weighted = level.surface_weight * weights
-        count += _pull_to_surfaces(equations, moved, weighted, target, scale_m, share)
-    if level.crease_weight > 0.0:
-        weighted = level.crease_weight * weights
-        reach_m = GATE_SCALES * scale_m
-        if level.surface_weight > 0.0 and len(target.surface_points):
-            # Surfaces bring lines near first, and more surely.
-            reach_m = min(reach_m, CREASE_REACH * target.resolution_m)
-        count += _pull_to_creases(equations, moved, directions, weighted, target, scale_m, reach_m)
-    return count
+) -> Pairs:
+    """The nearest surface of each sample, and the nearest crease that runs its way."""
+    nothing = np.full(len(moved), -1)
+    surfaces, creases, reach_m = nothing, nothing, GATE_SCALES * scale_m
+    has_surfaces = level.surface_weight > 0.0 and len(target.surface_points) > 0
+    if has_surfaces:
+        _, rows = target.surface_tree.query(moved, distance_upper_bound=reach_m)
+        surfaces = np.where(rows < len(target.surface_points), rows, -1)
+        # Surfaces bring lines near first, and more surely.
+        reach_m = min(reach_m, CREASE_REACH * target.resolution_m)
+    if level.crease_weight > 0.0 and target.crease_tree is not None:
+        creases = _creases_alike(moved, directions, target, reach_m)
+    return Pairs(moved=moved, surfaces=surfaces, creases=creases)
 
 
-def _pull_to_surfaces(
-    equations: Equations,
+def _creases_alike(
+    moved: FloatArray, directions: FloatArray, target: PreparedCloud, reach_m: float
+) -> IntArray:
+    """(P,) of the creases near each sample the one that passes nearest and runs alike; -1 for none."""
+    assert target.crease_tree is not None
+    distance_m, near = target.crease_tree.query(moved, k=CREASE_COUNT, distance_upper_bound=reach_m)
+    paired = np.flatnonzero(np.isfinite(distance_m[:, 0]))
+    known = np.isfinite(distance_m[paired])
+    near = np.where(known, near[paired], 0)
+    u = target.creases.directions[near]
+    off = moved[paired, None] - target.creases.points[near]
+    off = off - dot(off, u)[..., None] * u
+    alike = np.abs(dot(u, directions[paired, None])) > CREASE_COSINE
+    across_m = np.where(known & alike, norm(off), np.inf)
+    best = across_m.argmin(axis=1)
+    each = np.arange(len(paired))
+    rows = np.full(len(moved), -1)
+    rows[paired] = np.where(np.isfinite(across_m[each, best]), near[each, best], -1)
+    return rows
+
+
+def _equations(
+    pairs: Pairs,
     moved: FloatArray,
     weights: FloatArray,
     target: PreparedCloud,
     scale_m: float,
     point_share: float,
-) -> int:
-    """Add samples and the nearest surfaces, along the normals; answers how many."""
-    distance_m, nearest = target.surface_tree.query(
-        moved, distance_upper_bound=GATE_SCALES * scale_m, workers=-1
+    level: Level,
+    pivot: FloatArray,
+) -> Equations:
+    """The normal equations of all pairs where the samples are now."""
+    to_surfaces, surface_weight = surface_sums(
+        moved,
+        level.surface_weight * weights,
+        pairs.surfaces,
+        target.surface_points,
+        target.surface_normals,
+        scale_m,
+        point_share,
+        pivot,
     )
-    paired = np.isfinite(distance_m)
-    p, nearest, weights = moved[paired], nearest[paired], weights[paired]
-    n = target.surface_normals[nearest]
-    off = p - target.surface_points[nearest]
-    along_normal = dot(n, off)
-    # While the scale is coarse the whole distance counts: far along a surface is far as well.
-    size_m = norm(off) if point_share else along_normal
-    weights = weights * _geman_mcclure(size_m, scale_m)
-    equations.add(p, n, along_normal, weights)
-    if point_share:
-        for axis in np.eye(3):
-            equations.add(p, np.broadcast_to(axis, p.shape), off @ axis, point_share * weights)
-    return len(p)
-
-
-def _pull_to_creases(
-    equations: Equations,
-    moved: FloatArray,
-    directions: FloatArray,
-    weights: FloatArray,
-    target: PreparedCloud,
-    scale_m: float,
-    reach_m: float,
-) -> int:
-    """Add samples and the nearest creases that run their way, across; answers how many."""
-    if target.crease_tree is None:
-        return 0
-    distance_m, near = target.crease_tree.query(moved, k=CREASE_COUNT, distance_upper_bound=reach_m)
-    known = np.isfinite(distance_m)
-    near = np.where(known, near, 0)
-    u = target.creases.directions[near]
-    off = moved[:, None] - target.creases.points[near]
-    off = off - np.einsum("pkc,pkc->pk", off, u)[..., None] * u
-    alike = np.abs(np.einsum("pkc,pc->pk", u, directions)) > CREASE_COSINE
-    across_m = np.where(known & alike, norm(off), np.inf)
-    best = across_m.argmin(axis=1)
-    paired = np.flatnonzero(np.isfinite(across_m[np.arange(len(best)), best]))
-    best = best[paired]
-    u, off = u[paired, best], off[paired, best]
-    weights = weights[paired] * _geman_mcclure(across_m[paired, best], scale_m)
-    first = any_normal(u)
-    for n in (first, _cross(u, first)):
-        equations.add(moved[paired], n, dot(off, n), weights)
-    return len(paired)
-
-
-def _geman_mcclure(distance_m: FloatArray, scale_m: float) -> FloatArray:
-    """Weights that fall to a quarter at the scale, and with the fourth power beyond."""
-    return np.asarray((scale_m**2 / (scale_m**2 + distance_m**2)) ** 2)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N, 3) cross products; numpy's own takes four times as long."""
-    ax, ay, az = a.T
-    bx, by, bz = b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    to_creases, crease_weight = crease_sums(
+        moved,
+        level.crease_weight * weights,
+        pairs.creases,
+        target.creases.points,
+        target.creases.directions,
+        scale_m,
+        pivot,
+    )
+    upper = to_surfaces + to_creases
+    sums = upper + np.triu(upper, 1).T
+    total = max(surface_weight + crease_weight, 1e-9)
+    return Equations(H=sums[:7, :7], g=sums[:7, 7], variance_m2=float(sums[7, 7]) / total)

@@ -66,9 +66,10 @@ def fit_patches(points: FloatArray, cell_m: float) -> Patches:
     """Planes through all cubes of 2 x 2 x 2 cells that are flat, made firmer by their likes."""
     centre = points.mean(axis=0)
     moments = _window_moments(points - centre, cell_m)
+    moments = moments[moments[:, 0] >= MIN_POINT_COUNT]
     mean, covariance = _mean_and_covariance(moments)
     values, vectors = np.linalg.eigh(covariance)
-    enough = (moments[:, 0] >= MIN_POINT_COUNT) & (values[:, 0] < MAX_FLATNESS * values[:, 1])
+    enough = values[:, 0] < MAX_FLATNESS * values[:, 1]
     if not enough.any():
         return Patches(centres=np.empty((0, 3)), normals=np.empty((0, 3)))
     flat = enough & (values[:, 0] < (MAX_THICKNESS_RATIO**2) * np.median(values[enough, 0]))
@@ -135,16 +136,33 @@ def normals_of(
     """(N, 3) normals of the patches that hold the points, and (N,) whether one does."""
     if len(patches.centres) == 0:
         return np.zeros_like(points), np.zeros(len(points), np.bool_)
-    distance, near = tree.query(
-        points, k=CANDIDATE_COUNT, distance_upper_bound=REACH_CELLS * cell_m, workers=-1
+    reach_m = REACH_CELLS * cell_m
+    near, is_held = _holding(points, patches, tree, 1, reach_m, tolerance_m)
+    # Most points lie on the nearest patch; of the others the next ones are looked at.
+    left = np.flatnonzero(~is_held)
+    near[left], is_held[left] = _holding(
+        points[left], patches, tree, CANDIDATE_COUNT, reach_m, tolerance_m
     )
+    return patches.normals[near], is_held
+
+
+def _holding(
+    points: FloatArray,
+    patches: Patches,
+    tree: cKDTree,
+    count: int,
+    reach_m: float,
+    tolerance_m: float,
+) -> tuple[IntArray, BoolArray]:
+    """(N,) of so many patches near each point the nearest whose plane holds it, and whether one does."""
+    numbers = list(range(1, count + 1))
+    distance, near = tree.query(points, k=numbers, distance_upper_bound=reach_m)
     known = np.isfinite(distance)
     near = np.where(known, near, 0)
     off = np.abs(dot(patches.normals[near], points[:, None] - patches.centres[near]))
-    # Of the planes that hold a point the nearest patch's is taken.
     holds = known & (off < tolerance_m)
     first = np.argmax(holds, axis=1)
-    return patches.normals[near[np.arange(len(points)), first]], holds.any(axis=1)
+    return near[np.arange(len(points)), first], holds.any(axis=1)
 
 
 def find_creases(patches: Patches, tree: cKDTree, points: cKDTree, cell_m: float) -> Creases:
@@ -167,7 +185,7 @@ def find_creases(patches: Patches, tree: cKDTree, points: cKDTree, cell_m: float
     reach_m = REACH_CELLS * cell_m
     near = np.maximum(norm(points_on - c1), norm(points_on - c2)) < reach_m
     # Planes that would meet behind a gap make no edge.
-    gap_m, _ = points.query(points_on[near], distance_upper_bound=cell_m, workers=-1)
+    gap_m, _ = points.query(points_on[near], distance_upper_bound=cell_m)
     kept = np.flatnonzero(near)[gap_m < 0.6 * cell_m]
     return _merged(points_on[kept], direction[kept], 0.5 * cell_m)
 

@@ -103,7 +103,7 @@ def judge(
     """
     samples = source.samples
     moved = _moved(alignment, samples)
-    distance_m, _ = target.tree.query(moved, distance_upper_bound=config.max_distance_m, workers=-1)
+    distance_m, _ = target.tree.query(moved, distance_upper_bound=config.max_distance_m)
     near = np.isfinite(distance_m)
     found = agreement(alignment, source, target)
     alternatives = _alternatives(alignment, rivals, found.score, source, config)

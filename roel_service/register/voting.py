@@ -13,6 +13,7 @@ from scipy import fft, ndimage
 
 from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
 from roel_service.register.surfaces import Creases
+from roel_service.register.voting_kernels import count_votes
 
 # Lines and creases this near to a direction (cosine) vote in its channel.
 CHANNEL_COSINE = 0.93
@@ -23,6 +24,8 @@ MAX_CELL_COUNT = 1 << 20
 # The fine grid's cells in one of the coarse grid's, and how many of its cells a shift may move.
 FINE_CELLS, FINE_REACH = 3, 3
 MAX_FINE_CELL_COUNT = 1 << 22
+# Few shifts are counted sample by sample; beyond so many look-ups a correlation is faster.
+MAX_COUNTED = 6_000_000
 # Samples that are looked at on the fine grid.
 FINE_SAMPLE_COUNT = 300
 
@@ -36,9 +39,10 @@ class VotingGrid:
         origin: (3,) m, corner of the grid.
         cell_m: size of a cell.
         shape: cells of the grid along each axis, the source's share included.
-        spectra: of each direction's channel, and of the surfaces last.
+        coarse: (K + 1, *shape) presence in each direction's channel, and of surfaces last.
+        spectra: of the coarse channels.
         source_size_m: largest extent that a source may have in any direction.
-        fine: (K + 1, *F) presence in each channel on the fine grid, zero on its border.
+        fine: (K + 1, *F) the same on the fine grid.
         fine_cell_m: size of its cells.
     """
 
@@ -46,6 +50,7 @@ class VotingGrid:
     origin: FloatArray
     cell_m: float
     shape: tuple[int, ...]
+    coarse: Array
     spectra: list[Array]
     source_size_m: float
     fine: Array
@@ -93,9 +98,9 @@ def voting_grid(
     channel = channels_of(creases.directions, axes)
     members = [creases.points[channel == k] for k in range(len(axes))] + [surfaces]
     weights = [1.0] * len(axes) + [SURFACE_WEIGHT]
-    spectra, fine = [], []
+    coarse, fine = [], []
     for points, weight in zip(members, weights, strict=True):
-        spectra.append(_spectrum(weight * _presence(points, origin, cell_m, shape)))
+        coarse.append(weight * _presence(points, origin, cell_m, shape))
         corner = origin - fine_cell_m
         fine.append(weight * _presence(points, corner, fine_cell_m, fine_shape))
     return VotingGrid(
@@ -103,7 +108,8 @@ def voting_grid(
         origin=origin,
         cell_m=cell_m,
         shape=shape,
-        spectra=spectra,
+        coarse=np.stack(coarse),
+        spectra=[_spectrum(channel) for channel in coarse],
         source_size_m=source_size_m,
         fine=np.stack(fine),
         fine_cell_m=fine_cell_m,
@@ -126,15 +132,8 @@ def sharpened(
     offsets = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     corner = grid.origin - grid.fine_cell_m
     cells = np.rint((points + shift - corner) / grid.fine_cell_m).astype(np.int64)
-    # What falls outside meets the empty border.
-    limit = np.array(grid.fine.shape[1:]) - 1
-    places = np.clip(cells + offsets[:, None], 0, limit)
-    x, y, z = places[..., 0], places[..., 1], places[..., 2]
-    scores = grid.fine[-1, x, y, z].sum(axis=1)
     channel = channels_of(directions, grid.axes)
-    known = channel >= 0
-    if known.any():
-        scores += grid.fine[channel[known], x[:, known], y[:, known], z[:, known]].sum(axis=1)
+    scores = count_votes(grid.fine, cells, channel, offsets, False)
     # Of equal ones the nearest to the coarse shift.
     best = np.lexsort((np.abs(offsets).sum(axis=1), -scores))[0]
     return np.asarray(shift + offsets[best] * grid.fine_cell_m)
@@ -168,6 +167,27 @@ def vote(
     # Wild lines that the grid does not hold vote somewhere in it; they are few.
     cells = np.rint((points - corner) / grid.cell_m).astype(np.int64) % np.array(grid.shape)
     channel = channels_of(directions, grid.axes)
+    # Cells of the source start at `corner`: a shift by i cells puts it at origin + i cells.
+    offset = grid.origin - corner
+    inside = None if allowed is None else _within(grid, offset, allowed, reach_m)
+    if inside is not None and np.count_nonzero(inside) * len(points) < MAX_COUNTED:
+        scores = _counted(grid, cells, channel, inside)
+    else:
+        scores = _correlated(grid, cells, channel)
+        if inside is not None:
+            scores[~inside] = -np.inf
+    return _peaks(grid, scores / len(points), offset, count)
+
+
+def _counted(grid: VotingGrid, cells: IntArray, channel: IntArray, inside: BoolArray) -> Array:
+    """Votes for the shifts inside a part of the grid, minus infinity elsewhere."""
+    scores = np.full(grid.shape, -np.inf, np.float32)
+    scores[inside] = count_votes(grid.coarse, cells, channel, np.argwhere(inside), True)
+    return scores
+
+
+def _correlated(grid: VotingGrid, cells: IntArray, channel: IntArray) -> Array:
+    """Votes for all shifts of the grid."""
     total = np.zeros((*grid.shape[:2], grid.shape[2] // 2 + 1), np.complex64)
     for k, spectrum in enumerate(grid.spectra):
         chosen = cells if k == len(grid.axes) else cells[channel == k]
@@ -175,12 +195,7 @@ def vote(
             votes = np.zeros(grid.shape, np.float32)
             np.add.at(votes, tuple(chosen.T), 1.0)
             total += spectrum * np.conj(_spectrum(votes))
-    scores = fft.irfftn(total, grid.shape, workers=2) / len(points)
-    # Cells of the source start at `corner`: a shift by i cells puts it at origin + i cells.
-    offset = grid.origin - corner
-    if allowed is not None:
-        scores[~_within(grid, offset, allowed, reach_m)] = -np.inf
-    return _peaks(grid, scores, offset, count)
+    return np.asarray(fft.irfftn(total, grid.shape, workers=2))
 
 
 def _within(grid: VotingGrid, offset: FloatArray, allowed: FloatArray, reach_m: float) -> BoolArray:
