@@ -32,8 +32,8 @@ REPAIR_SHARE = 0.25
 SETTLED_STEP = 2e-5
 # Pairs below which nothing can be solved.
 MIN_PAIR_COUNT = 6
-# One line's samples err together: they count as so many independent ones.
-INDEPENDENT_PER_LINE = 2.0
+# One line's samples err together, and lines share the errors of poses: so many count as independent ones.
+INDEPENDENT_PER_LINE = 0.5
 # No cloud and no map is better than this.
 MIN_SIGMA_M = 1e-3
 # Of the largest eigenvalue: what is held less firmly than that stays where it is.
