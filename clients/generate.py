@@ -26,6 +26,7 @@ WORDS = {
     "AsyncOperation": "Operation",
     "AsyncConnection": "Connection",
     "AsyncExchange": "Exchange",
+    "AsyncPictureStream": "PictureStream",
     "AsyncIterator": "Iterator",
     "AsyncGenerator": "Generator",
     "__aenter__": "__enter__",

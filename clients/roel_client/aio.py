@@ -10,18 +10,20 @@ import asyncio
 import contextlib
 import hashlib
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
-from roel_client.connection import AsyncConnection, Endpoint, Tls
+from roel_client.connection import AsyncConnection, AsyncExchange, Endpoint, Tls
 from roel_client.embedded import async_served
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
 from roel_client.uploads import BlobDownload, BlobUpload, EventUpload, events_of_chunk
-from roel_service.config.stages import Config
+from roel_service.arrays import Array
+from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
 from roel_service.errors import CorruptionError, RoelError
+from roel_service.geometry.se3 import SE3
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSlice, EventSource
@@ -33,8 +35,12 @@ from roel_service.v1 import (
     capabilities_pb2_grpc,
     events_pb2,
     events_pb2_grpc,
+    localization_pb2,
+    localization_pb2_grpc,
     maps_pb2,
     maps_pb2_grpc,
+    registration_pb2,
+    registration_pb2_grpc,
     types_pb2,
 )
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
@@ -42,7 +48,9 @@ from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 from roel_service.wire import names
 from roel_service.wire.configs import config_to_proto
 from roel_service.wire.errors import error_from_status
+from roel_service.wire.localization import localize_request, prior_to_proto
 from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
+from roel_service.wire.registration import register_request
 from roel_service.wire.results import Report, progress_from_proto, report_from_proto
 
 Result = TypeVar("Result")
@@ -51,6 +59,9 @@ Result = TypeVar("Result")
 FINALIZE_TIMEOUT_S = 300.0
 
 DEFAULT_RETRY = RetryPolicy()
+
+# The first answer waits for a child that starts, and for a cloud that is prepared.
+ANSWER_TIMEOUT_S = 120.0
 
 # About 0.8 MiB a message.
 POSES_PER_MESSAGE = 8192
@@ -87,6 +98,8 @@ class AsyncClient:
         self._blobs = blobs_pb2_grpc.BlobServiceStub(channel)
         self._streams = events_pb2_grpc.EventStreamServiceStub(channel)
         self._maps = maps_pb2_grpc.MapServiceStub(channel)
+        self._localization = localization_pb2_grpc.LocalizationServiceStub(channel)
+        self._registration = registration_pb2_grpc.RegistrationServiceStub(channel)
 
     @classmethod
     @contextlib.asynccontextmanager
@@ -236,6 +249,92 @@ class AsyncClient:
         begun = await self._connection.call(self._maps.BuildMap, request)
         return self.operation(begun.name)
 
+    async def import_map(self, map_name: str, path: Path) -> AsyncOperation:
+        """Begin to make a new version of a map from a file of lines."""
+        blob = await self.upload_blob(path)
+        request = maps_pb2.ImportMapRequest(parent=map_name, blob=blob)
+        begun = await self._connection.call(self._maps.ImportMap, request)
+        return self.operation(begun.name)
+
+    @contextlib.asynccontextmanager
+    async def hosted_map(self, path: Path) -> AsyncIterator[str]:
+        """Name of a version made from a file of lines, there as long as the block lasts."""
+        async with self._temporary_map() as map_name:
+            operation = await self.import_map(map_name, path)
+            version = await operation.wait()
+            yield version.name
+
+    async def register(
+        self,
+        map_version: str,
+        target: str | types_pb2.BlobRef | Array,
+        *,
+        T_init: SE3 | None = None,
+        method: str = "auto",
+        config: RegisterConfig | None = None,
+        timeout_s: float = ANSWER_TIMEOUT_S,
+    ) -> registration_pb2.RegisterResponse:
+        """Where a map lies in a cloud, or in another map.
+
+        Args:
+            map_version: name of the version that is laid over the target.
+            target: name of a version, an uploaded cloud, or (N, 3) points, m.
+            T_init: first T_target_source; the identity by default.
+            method: `auto`, `point`, `plane`, `line`, or `global`, which takes no first guess.
+            config: parameters; those of the server by default.
+        """
+        request = register_request(map_version, target, T_init=T_init, method=method, config=config)
+        call = self._registration.Register
+        return await self._connection.call(call, request, timeout_s=timeout_s)
+
+    async def localize(
+        self,
+        map_versions: Sequence[str],
+        image: bytes | types_pb2.BlobRef,
+        *,
+        T_prior: SE3 | None = None,
+        max_hypothesis_count: int = 0,
+        config: LocalizeConfig | None = None,
+        timeout_s: float = ANSWER_TIMEOUT_S,
+    ) -> localization_pb2.LocalizeResponse:
+        """Where a picture was taken.
+
+        Args:
+            map_versions: names of the versions that may hold the place.
+            image: JPEG or PNG, or an uploaded one.
+            T_prior: first T_world_panorama.
+            max_hypothesis_count: most answers; 0 takes what the parameters say.
+            config: parameters; those of the server by default.
+        """
+        request = localize_request(
+            map_versions, T_prior=T_prior, max_hypothesis_count=max_hypothesis_count, config=config
+        )
+        if isinstance(image, bytes):
+            request.image = image
+        else:
+            request.image_blob.CopyFrom(image)
+        return await self._connection.call(
+            self._localization.Localize, request, timeout_s=timeout_s
+        )
+
+    @contextlib.asynccontextmanager
+    async def localizing(
+        self,
+        map_versions: Sequence[str],
+        *,
+        T_prior: SE3 | None = None,
+        max_hypothesis_count: int = 0,
+        config: LocalizeConfig | None = None,
+    ) -> AsyncIterator[AsyncPictureStream]:
+        """A stream of pictures, answered in their order; arguments as of `localize`."""
+        setup = localize_request(
+            map_versions, T_prior=T_prior, max_hypothesis_count=max_hypothesis_count, config=config
+        )
+        async with self._connection.exchange(self._localization.StreamLocalize) as exchange:
+            await exchange.send(localization_pb2.StreamLocalizeRequest(setup=setup))
+            accepted = (await exchange.receive()).accepted
+            yield AsyncPictureStream(exchange, accepted)
+
     def operation(self, name: str) -> AsyncOperation:
         """A build that was begun before, perhaps by somebody else."""
         return AsyncOperation(self._connection, name)
@@ -311,6 +410,35 @@ class AsyncClient:
         finally:
             with contextlib.suppress(RoelError):
                 await self.delete_map(name, purge=True)
+
+
+class AsyncPictureStream:
+    """Pictures of a robot on their way; sending and receiving may be two tasks.
+
+    Attributes:
+        map_versions: the versions that are searched.
+        credit_pictures: so many pictures may be unanswered.
+    """
+
+    def __init__(self, exchange: AsyncExchange, accepted: localization_pb2.StreamAccepted) -> None:
+        self._exchange = exchange
+        self.map_versions = list(accepted.map_versions)
+        self.credit_pictures = int(accepted.credit_pictures)
+
+    async def send(self, picture_id: int, image: bytes, *, T_prior: SE3 | None = None) -> None:
+        """The next picture, JPEG or PNG; its id comes back with its answer."""
+        picture = localization_pb2.StreamPicture(picture_id=picture_id, image=image)
+        if T_prior is not None:
+            picture.prior.CopyFrom(prior_to_proto(T_prior))
+        await self._exchange.send(localization_pb2.StreamLocalizeRequest(picture=picture))
+
+    async def finish(self) -> None:
+        """Say that no picture follows."""
+        await self._exchange.finish()
+
+    async def receive(self) -> localization_pb2.StreamLocalizeResponse | None:
+        """The next answer, or why there is none; None after the last."""
+        return await self._exchange.receive()
 
 
 class AsyncOperation:

@@ -9,15 +9,17 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from roel_client.naming import naming
+from roel_service.naming import naming
+from roel_service.wire.names import is_resource_name
 
 if TYPE_CHECKING:
+    from roel_client.client import Client
     from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
     from roel_service.io.events import EventFile
     from roel_service.progress import ProgressCallback
@@ -26,9 +28,12 @@ if TYPE_CHECKING:
     from roel_service.scene.lines import LineMap
     from roel_service.scene.results import PanoLocResult, RegistrationResult
     from roel_service.scene.trajectory import Trajectory
+    from roel_service.v1.types_pb2 import BlobRef
     from roel_service.wire.rlm import MapFile
 
 RLM_MAGIC = b"RLM1"
+# A message has 4 MiB.
+MAX_INLINE_BYTES = 3_500_000
 US_PER_DAY = 24 * 3600 * 1_000_000
 
 
@@ -222,12 +227,16 @@ def evaluate_map(name: str, mesh: str, edges: str) -> dict[str, Any]:
 
 
 def _read_map(name: str) -> LineMap:
-    from roel_service.io.files import open_input
     from roel_service.io.maps import read_exported_map
 
+    return read_map_file(name).line_map if _is_map_file(name) else read_exported_map(Path(name))
+
+
+def _is_map_file(name: str) -> bool:
+    from roel_service.io.files import open_input
+
     with open_input(Path(name)) as file:
-        is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
-    return read_map_file(name).line_map if is_map_file else read_exported_map(Path(name))
+        return file.read(len(RLM_MAGIC)) == RLM_MAGIC
 
 
 def register_map(
@@ -257,14 +266,71 @@ def register_map(
     return _registration_document(result, seconds)
 
 
+def register_map_remotely(
+    name: str,
+    cloud_name: str,
+    *,
+    init: str | None,
+    method: str,
+    config: RegisterConfig,
+    plot: Path | None,
+    server: str,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """Let a server register a map with a cloud; as `register_map`.
+
+    Args:
+        name, cloud_name: files, or names of versions that the server has.
+        server: `HOST:PORT`.
+        options: arguments of `Client` beside the address.
+    """
+    from roel_client.client import Client
+    from roel_service.evaluation.registration_figures import draw_registration
+    from roel_service.geometry.se3 import SE3
+    from roel_service.io.transforms import read_transform
+    from roel_service.wire.registration import registration_from_proto
+
+    T_init = None if init is None else read_transform(Path(init))
+    with (
+        naming({"cloud": cloud_name}),
+        Client(server, **options) as client,
+        _hosted(client, name) as version,
+        _hosted_target(client, cloud_name) as target,
+        naming({version: name}),
+    ):
+        message = client.register(version, target, T_init=T_init, method=method, config=config)
+    result = registration_from_proto(message)
+    if plot is not None:
+        start = SE3.identity() if T_init is None else T_init
+        draw_registration(_read_map(name), _read_target(cloud_name), start, result, plot)
+    return _registration_document(result, message.seconds)
+
+
+@contextmanager
+def _hosted(client: Client, name: str) -> Iterator[str]:
+    """Name of a version on the server: one that is there, or a file's for a while."""
+    if is_resource_name(name):
+        yield name
+        return
+    with naming({"imported file": name}), client.hosted_map(Path(name)) as version:
+        yield version
+
+
+@contextmanager
+def _hosted_target(client: Client, name: str) -> Iterator[str | BlobRef]:
+    """The same for what a map is registered with, which may be a cloud."""
+    if is_resource_name(name) or _is_map_file(name):
+        with _hosted(client, name) as version:
+            yield version
+    else:
+        yield client.upload_blob(Path(name))
+
+
 def _read_target(name: str) -> PointCloud | LineMap:
     """What a map is registered with: a `.rlm` file, or a cloud of any format."""
     from roel_service.io.clouds import read_cloud
-    from roel_service.io.files import open_input
 
-    with open_input(Path(name)) as file:
-        is_map_file = file.read(len(RLM_MAGIC)) == RLM_MAGIC
-    return read_map_file(name).line_map if is_map_file else read_cloud(Path(name))
+    return read_map_file(name).line_map if _is_map_file(name) else read_cloud(Path(name))
 
 
 def _registration_document(result: RegistrationResult, seconds: float) -> dict[str, Any]:
@@ -308,7 +374,6 @@ def localize_panoramas(
         config: parameters.
         overlay: folder to make, for one picture each.
     """
-    from roel_service.evaluation.panorama_figures import draw_overlay
     from roel_service.io.images import read_panorama
     from roel_service.io.transforms import read_transform
     from roel_service.pano_loc.hints import PosePrior
@@ -328,10 +393,67 @@ def localize_panoramas(
         result = localize_panorama(grey, maps, config, prior=first)
         seconds = time.perf_counter() - started_s
         if overlay is not None:
-            path = overlay / f"{index:03d}-{Path(panorama_name).stem}.png"
-            best = result.hypotheses[0].map_index if result.hypotheses else 0
-            draw_overlay(grey, line_maps[best], result.T_world_panorama, path)
+            _draw_overlay(overlay, index, panorama_name, line_maps, result)
         yield _localization_document(panorama_name, names, result, seconds)
+
+
+def localize_panoramas_remotely(
+    names: list[str],
+    panorama_names: list[str],
+    *,
+    prior: str | None,
+    config: LocalizeConfig,
+    overlay: Path | None,
+    server: str,
+    options: dict[str, Any],
+) -> Iterator[dict[str, Any]]:
+    """Let a server locate panoramas; as `localize_panoramas`.
+
+    Args:
+        names: of maps: files, or versions that the server has.
+        server: `HOST:PORT`.
+        options: arguments of `Client` beside the address.
+    """
+    from roel_client.client import Client
+    from roel_service.io.images import read_panorama
+    from roel_service.io.transforms import read_transform
+    from roel_service.wire.localization import localization_from_proto
+
+    T_prior = None if prior is None else read_transform(Path(prior))
+    for panorama_name in panorama_names:
+        read_panorama(Path(panorama_name))
+    line_maps = []
+    if overlay is not None:
+        line_maps = [_read_map(name) for name in names]
+        overlay.mkdir()
+    with Client(server, **options) as client, ExitStack() as hosting:
+        versions = [hosting.enter_context(_hosted(client, name)) for name in names]
+        for index, panorama_name in enumerate(panorama_names):
+            with naming({"image": panorama_name}):
+                image = _sent_image(client, Path(panorama_name))
+                message = client.localize(versions, image, T_prior=T_prior, config=config)
+            result = localization_from_proto(message)
+            if overlay is not None:
+                _draw_overlay(overlay, index, panorama_name, line_maps, result)
+            yield _localization_document(panorama_name, names, result, message.seconds)
+
+
+def _sent_image(client: Client, path: Path) -> bytes | BlobRef:
+    """A picture as a request has it: itself if it is small enough, else uploaded."""
+    if path.stat().st_size > MAX_INLINE_BYTES:
+        return client.upload_blob(path)
+    return path.read_bytes()
+
+
+def _draw_overlay(
+    folder: Path, index: int, name: str, line_maps: list[LineMap], result: PanoLocResult
+) -> None:
+    from roel_service.evaluation.panorama_figures import draw_overlay
+    from roel_service.io.images import read_panorama
+
+    best = result.hypotheses[0].map_index if result.hypotheses else 0
+    path = folder / f"{index:03d}-{Path(name).stem}.png"
+    draw_overlay(read_panorama(Path(name)), line_maps[best], result.T_world_panorama, path)
 
 
 def _localization_document(

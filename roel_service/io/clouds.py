@@ -67,11 +67,19 @@ def read_cloud(path: Path) -> PointCloud:
         CloudError: none of these formats, fewer than `MIN_CLOUD_COUNT` finite points, or points
             too far from the origin for float32.
     """
-    cloud = _cloud_of_any_format(path)
+    return _within_reach(_cloud_of_any_format(path), str(path))
+
+
+def cloud_of_points(points: Array, subject: str) -> PointCloud:
+    """A cloud of (N, 3) points, m; raises `CloudError` as `read_cloud`."""
+    return _within_reach(_cloud(points, None, MIN_CLOUD_COUNT, subject), subject)
+
+
+def _within_reach(cloud: PointCloud, subject: str) -> PointCloud:
     reach_m = float(np.abs(cloud.points).max())
     if reach_m > MAX_REACH_M:
         expected = f"points within {MAX_REACH_M:.0f} m of the origin (move the frame there)"
-        raise CloudError(str(path), expected, f"{reach_m:.0f} m")
+        raise CloudError(subject, expected, f"{reach_m:.0f} m")
     return cloud
 
 

@@ -55,7 +55,7 @@ class InlineExecutor:
             loop.call_soon_threadsafe(messages.put_nowait, news)
 
         def work() -> None:
-            message = worker.last_message(spec, tell)
+            message = worker.last_message(spec, tell, worker.Workshop())
             loop.call_soon_threadsafe(messages.put_nowait, message)
 
         running = asyncio.create_task(asyncio.to_thread(work))

@@ -32,6 +32,11 @@ class Prepared(NamedTuple):
     waits_s: float = 0.0
 
 
+def cache_place(store: Store, max_bytes: int) -> CachePlace | None:
+    """Where results of stages and prepared inputs are kept, at most so much of them; 0 is nowhere."""
+    return CachePlace(folder=store.folder / CACHE, max_bytes=max_bytes) if max_bytes else None
+
+
 # Called in a thread for each attempt.
 Prepare = Callable[[OperationRecord, TaskRecord], Prepared]
 
@@ -81,7 +86,7 @@ def build_preparation(
         cache_bytes: kept of the results of stages; 0 keeps nothing.
         patience_s: an upload that is followed may stand still for so long.
     """
-    cache = CachePlace(folder=store.folder / CACHE, max_bytes=cache_bytes) if cache_bytes else None
+    cache = cache_place(store, cache_bytes)
 
     def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
         stream = store.event_streams.get(operation.event_stream_id)

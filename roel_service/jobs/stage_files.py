@@ -21,7 +21,7 @@ from roel_service.failpoints import failpoint
 from roel_service.mapping.stage_cache import Arrays
 
 # What a result depends on beside parameters and recording.
-CODE_FOLDERS = ("config", "geometry", "mapping", "scene")
+CODE_FOLDERS = ("config", "geometry", "mapping", "pano_loc", "register", "scene")
 SUFFIX = ".stage"
 
 # Fast: most of the bytes are floating-point numbers without pattern.

@@ -31,7 +31,7 @@ class TaskSpec:
 
     Attributes:
         entrypoint: `module:function`, imported where it runs alone; it is called with the
-            parameters and a `Tell`.
+            parameters and a `Tell`. Or `module:Class`, of which one object for each child is called.
         parameters: anything that can be pickled; inputs are named by files that never change.
     """
 

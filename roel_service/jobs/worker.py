@@ -34,6 +34,8 @@ LIBRARY_THREADS = (
 # A child takes what the front leaves.
 NICENESS = 10
 
+Work = Callable[[Any, Tell], Any]
+
 
 def serve(pipe: Connection, preload: str) -> None:
     """Body of a child: run each task that arrives, until nobody can send any more.
@@ -52,10 +54,31 @@ def serve(pipe: Connection, preload: str) -> None:
     memory.volunteer()
     if preload:
         pkgutil.resolve_name(preload)
+    workshop = Workshop()
     while (spec := received(pipe)) is not None:
         with memory.reserving_at_most(spec.limits.memory_bytes):
-            message = last_message(spec, thinned(pipe.send))
+            message = last_message(spec, thinned(pipe.send), workshop)
         pipe.send(message)
+
+
+class Workshop:
+    """Who does the work that tasks name.
+
+    An entry point is a function, or a class: of that one object is made, which may keep between tasks
+    what it likes.
+    """
+
+    def __init__(self) -> None:
+        self._made: dict[str, Work] = {}
+
+    def work(self, entrypoint: str) -> Work:
+        """The function, or the object."""
+        found = pkgutil.resolve_name(entrypoint)
+        if not isinstance(found, type):
+            return found  # type: ignore[no-any-return]
+        if entrypoint not in self._made:
+            self._made[entrypoint] = found()
+        return self._made[entrypoint]
 
 
 def received(pipe: Connection) -> Any:
@@ -66,11 +89,10 @@ def received(pipe: Connection) -> Any:
         return None
 
 
-def last_message(spec: TaskSpec, tell: Tell) -> Message:
+def last_message(spec: TaskSpec, tell: Tell, workshop: Workshop) -> Message:
     """Run the work to its end, whatever that is."""
     try:
-        work: Callable[[Any, Tell], Any] = pkgutil.resolve_name(spec.entrypoint)
-        return Done(result=work(spec.parameters, tell))
+        return Done(result=workshop.work(spec.entrypoint)(spec.parameters, tell))
     except RoelError as error:
         return error
     except MemoryError:

@@ -10,6 +10,8 @@ from roel_service.arrays import FloatArray, frozen_array
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 
+# Maps that may be asked for one picture.
+MAX_MAP_COUNT = 8
 DEFAULT_REACH_M, DEFAULT_REACH_RAD = 1.0, float(np.deg2rad(30.0))
 DEFAULT_UP_SIGMA_RAD = float(np.deg2rad(3.0))
 # Orientations stay within so many deviations of gravity, and never closer than this.

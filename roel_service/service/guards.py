@@ -106,6 +106,8 @@ class CallLimits:
     def __init__(self, settings: Settings) -> None:
         # Twice as many as may go on: each may be taken over by a younger call.
         self._uploads = Places(2 * settings.open_uploads, 0)
+        self._interactive = Places(settings.interactive_workers, settings.interactive_queued)
+        self._streams = Places(settings.open_streams, 0)
         self._methods: defaultdict[str, Places] = defaultdict(
             lambda: Places(settings.calls_in_flight, settings.calls_waiting)
         )
@@ -118,6 +120,10 @@ class CallLimits:
             place: Any = nullcontext()
         elif pool is Pool.UPLOADS:
             place = self._uploads.taken(call)
+        elif pool is Pool.INTERACTIVE:
+            place = self._interactive.taken(call)
+        elif pool is Pool.STREAMS:
+            place = self._streams.taken(call)
         else:
             place = self._methods[call.method].taken(call)
         async with place:

@@ -16,6 +16,10 @@ class Pool(Enum):
     METHOD = "method"
     # All uploads share one.
     UPLOADS = "uploads"
+    # All questions that a warm child answers share one.
+    INTERACTIVE = "interactive"
+    # All streams of pictures or events that are located share one; each costs little by itself.
+    STREAMS = "streams"
     # Never held up: a caller that only listens costs next to nothing.
     NONE = "none"
 
@@ -37,6 +41,8 @@ class Rule:
 
 # Answers with poses, and with nothing of a map.
 ANSWER = Rule(role=Role.LOCALIZE_ONLY)
+CONVERSE = Rule(role=Role.LOCALIZE_ONLY, pool=Pool.STREAMS)
+ASK = Rule(role=Role.LOCALIZE_ONLY, pool=Pool.INTERACTIVE)
 LOOK = Rule(role=Role.READER)
 WATCH = Rule(role=Role.READER, pool=Pool.NONE)
 CHANGE = Rule(role=Role.BUILDER, audited=True)
@@ -90,11 +96,12 @@ _METHODS: dict[str, dict[Rule, tuple[str, ...]]] = {
         ),
     },
     "roel_service.v1.RegistrationService": {
-        ANSWER: ("Register",),
+        ASK: ("Register",),
         CHANGE: ("BatchRegister",),
     },
     "roel_service.v1.LocalizationService": {
-        ANSWER: ("Localize", "StreamLocalize", "TrackPoses"),
+        ASK: ("Localize",),
+        CONVERSE: ("StreamLocalize", "TrackPoses"),
         CHANGE: ("BatchLocalize",),
     },
     "roel_service.v1.OperationService": {WATCH: ("WatchOperation",)},

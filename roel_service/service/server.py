@@ -27,6 +27,7 @@ from roel_service.jobs.upkeep import upkeep
 from roel_service.jobs.warm import WarmExecutor
 from roel_service.service.access import Access
 from roel_service.service.admin import Probes, admin_server
+from roel_service.service.asking import PRELOAD, Asking
 from roel_service.service.calls import Guard, GuardInterceptor
 from roel_service.service.exports import Exporter
 from roel_service.service.guards import CallLimits, Drain, told_errors
@@ -112,8 +113,12 @@ async def running(
             options=_options(settings),
             compression=None,
         )
-        executor = WarmExecutor(settings.concurrent_exports, settings.queued_exports)
-        add_services(server, store, scheduler, Exporter(store, executor, settings), settings)
+        exports = WarmExecutor(settings.concurrent_exports, settings.queued_exports)
+        questions = WarmExecutor(
+            settings.interactive_workers, settings.interactive_queued, preload=PRELOAD
+        )
+        exporter, asking = Exporter(store, exports, settings), Asking(questions, settings)
+        add_services(server, store, scheduler, exporter, asking, settings)
         health_servicer = await _add_health(server)
         address = listen.bind(server, credentials)
         admin = None
@@ -131,7 +136,8 @@ async def running(
             await scheduler.drain()
             await drain.finish(settings.drain_grace_s)
             await server.stop(STOP_GRACE_S)
-            await executor.close()
+            await exports.close()
+            await questions.close()
 
 
 def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:

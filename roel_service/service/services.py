@@ -6,14 +6,19 @@ from typing import Any
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
+from roel_service.jobs.preparation import cache_place
+from roel_service.jobs.questions import Questions
 from roel_service.jobs.scheduler import Scheduler
+from roel_service.service.asking import Asking
 from roel_service.service.blobs import BlobServicer
 from roel_service.service.capabilities import CapabilitiesServicer
 from roel_service.service.event_streams import EventStreamServicer
 from roel_service.service.exports import Exporter
+from roel_service.service.localization import LocalizationServicer
 from roel_service.service.maps import MapServicer
 from roel_service.service.methods import complete
 from roel_service.service.operations import OperationServicer
+from roel_service.service.registration import RegistrationServicer
 from roel_service.service.settings import Settings
 from roel_service.service.uploads import OpenUploads
 from roel_service.store.store import Store
@@ -70,15 +75,28 @@ SERVICES = tuple(descriptor.full_name for descriptor in _DESCRIPTORS.values())
 
 
 def add_services(
-    server: Any, store: Store, scheduler: Scheduler, exporter: Exporter, settings: Settings
+    server: Any,
+    store: Store,
+    scheduler: Scheduler,
+    exporter: Exporter,
+    asking: Asking,
+    settings: Settings,
 ) -> None:
     """Add every service of the protocol; methods that nobody wrote yet refuse."""
+    questions = Questions(
+        store.maps,
+        lambda sha256: store.uploads.path(store.uploads.use(sha256)),
+        cache_place(store, settings.stage_cache_bytes),
+        settings.inline_point_count,
+    )
     operations = OperationServicer(store, scheduler)
     uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
         "EventStreamService": EventStreamServicer(store, scheduler, uploads, settings),
         "BlobService": BlobServicer(store.uploads, uploads, settings),
         "MapService": MapServicer(store, scheduler, exporter, settings),
+        "RegistrationService": RegistrationServicer(questions, asking),
+        "LocalizationService": LocalizationServicer(questions, asking, settings),
         "OperationService": operations,
         "Operations": operations,
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from roel_service.pano_loc.hints import MAX_MAP_COUNT
 from roel_service.service.paging import MAX_PAGE_SIZE
 from roel_service.store import retention
 from roel_service.store.garbage import LONGEST_UPLOAD_S
@@ -47,6 +48,12 @@ class Settings:
         alias_count: most aliases of a map.
         calls_in_flight: calls of one method at a time.
         calls_waiting: calls of one method that may wait for their turn.
+        interactive_workers: children that answer callers who wait; all methods share them.
+        interactive_queued: such questions that may wait for a child.
+        interactive_time_s: how long an answer may take.
+        open_streams: streams of pictures or events that are located at a time.
+        stream_credit_pictures: pictures of a stream that may be unanswered.
+        inline_point_count: most points of a cloud that comes in a request.
         export_time_s: how long a version may take to be written in another format.
         concurrent_exports, queued_exports: such versions at a time, and those that may wait.
         drain_grace_s: how long calls other than uploads may go on after SIGTERM.
@@ -83,6 +90,12 @@ class Settings:
     alias_count: int = 64
     calls_in_flight: int = 32
     calls_waiting: int = 128
+    interactive_workers: int = 2
+    interactive_queued: int = 8
+    interactive_time_s: float = 120.0
+    inline_point_count: int = 250_000
+    open_streams: int = 32
+    stream_credit_pictures: int = 4
     export_time_s: float = 300.0
     concurrent_exports: int = 1
     queued_exports: int = 8
@@ -98,6 +111,11 @@ class Settings:
     def line_count(self) -> int:
         """Most lines of a map; the format decides."""
         return MAX_LINE_COUNT
+
+    @property
+    def maps_per_picture(self) -> int:
+        """Most versions that one picture is looked for in; the search decides."""
+        return MAX_MAP_COUNT
 
     @property
     def page_size(self) -> int:

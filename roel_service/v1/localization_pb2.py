@@ -25,11 +25,12 @@ _sym_db = _symbol_database.Default()
 from google.api import field_behavior_pb2 as google_dot_api_dot_field__behavior__pb2
 from google.longrunning import operations_pb2 as google_dot_longrunning_dot_operations__pb2
 from google.rpc import status_pb2 as google_dot_rpc_dot_status__pb2
+from roel_service.v1 import config_pb2 as roel__service_dot_v1_dot_config__pb2
 from roel_service.v1 import events_pb2 as roel__service_dot_v1_dot_events__pb2
 from roel_service.v1 import types_pb2 as roel__service_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/localization.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x17google/rpc/status.proto\x1a\x1croel_service/v1/events.proto\x1a\x1broel_service/v1/types.proto\"\xb6\x03\n\x0fLocalizeRequest\x12\x1a\n\x0cmap_versions\x18\x01 \x03(\tB\x04\xe2\x41\x01\x02\x12\x15\n\x05image\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x01H\x00\x12\x34\n\nimage_blob\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01H\x00\x12/\n\x05prior\x18\x04 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\x12\"\n\x14max_hypothesis_count\x18\x05 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x30\n\x08up_world\x18\x06 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x33\n\x0bup_panorama\x18\x07 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x1a\n\x0cup_sigma_deg\x18\x08 \x01(\x01\x42\x04\xe2\x41\x01\x01\x12-\n\x06\x63\x61mera\x18\t \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x01\x12\x14\n\x06preset\x18\n \x01(\tB\x04\xe2\x41\x01\x01\x12\x12\n\x04seed\x18\x0b \x01(\x03\x42\x04\xe2\x41\x01\x01\x42\t\n\x07picture\"\xc2\x03\n\x10LocalizeResponse\x12\x38\n\x06status\x18\x01 \x01(\x0e\x32(.roel_service.v1.LocalizeResponse.Status\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x33\n\nhypotheses\x18\x03 \x03(\x0b\x32\x1f.roel_service.v1.PoseHypothesis\x12=\n\x0b\x64iagnostics\x18\x04 \x01(\x0b\x32(.roel_service.v1.LocalizationDiagnostics\x12J\n\rstage_seconds\x18\x05 \x03(\x0b\x32\x33.roel_service.v1.LocalizeResponse.StageSecondsEntry\x12\x0f\n\x07seconds\x18\x06 \x01(\x01\x1a\x33\n\x11StageSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"^\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x10\n\x0cSTATUS_FOUND\x10\x01\x12\x14\n\x10STATUS_AMBIGUOUS\x10\x02\x12\x14\n\x10STATUS_NOT_FOUND\x10\x03\"\xc4\x01\n\x0ePoseHypothesis\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x34\n\x10T_world_panorama\x18\x02 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05score\x18\x03 \x01(\x01\x12,\n\ncovariance\x18\x04 \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12\x14\n\x0c\x65xplained_2d\x18\x05 \x01(\x01\x12\x14\n\x0c\x65xplained_3d\x18\x06 \x01(\x01\"\x98\x01\n\x17LocalizationDiagnostics\x12\r\n\x05\x66lags\x18\x01 \x03(\t\x12\x11\n\tarc_count\x18\x02 \x01(\x03\x12\x16\n\x0erotation_count\x18\x03 \x01(\x03\x12\x17\n\x0f\x63\x61ndidate_count\x18\x04 \x01(\x03\x12\x17\n\x0frunner_up_ratio\x18\x05 \x01(\x01\x12\x11\n\tambiguity\x18\x06 \x01(\t\"\x85\x01\n\x15StreamLocalizeRequest\x12\x31\n\x05setup\x18\x01 \x01(\x0b\x32 .roel_service.v1.LocalizeRequestH\x00\x12\x31\n\x07picture\x18\x02 \x01(\x0b\x32\x1e.roel_service.v1.StreamPictureH\x00\x42\x06\n\x04part\"o\n\rStreamPicture\x12\x18\n\npicture_id\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x13\n\x05image\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\x12/\n\x05prior\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\"\x93\x01\n\x16StreamLocalizeResponse\x12\x12\n\npicture_id\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.LocalizeResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x42\t\n\x07outcome\"\xb2\x01\n\x14\x42\x61tchLocalizeRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x08requests\x18\x02 \x03(\x0b\x32 .roel_service.v1.LocalizeRequestB\x04\xe2\x41\x01\x01\x12\x30\n\x08manifest\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"j\n\x15\x42\x61tchLocalizeResponse\x12\'\n\x05items\x18\x01 \x01(\x0b\x32\x18.roel_service.v1.BlobRef\x12\x12\n\nitem_count\x18\x02 \x01(\x03\x12\x14\n\x0c\x66\x61iled_count\x18\x03 \x01(\x03\"\x89\x01\n\x11\x42\x61tchLocalizeItem\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.LocalizeResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x42\t\n\x07outcome\"z\n\x11TrackPosesRequest\x12/\n\x05setup\x18\x01 \x01(\x0b\x32\x1e.roel_service.v1.TrackingSetupH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"\xbd\x01\n\rTrackingSetup\x12\x19\n\x0bmap_version\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12-\n\x06\x63\x61mera\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x38\n\x0eT_world_camera\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x02\x12\x12\n\x04t_us\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x14\n\x06preset\x18\x05 \x01(\tB\x04\xe2\x41\x01\x01\"\xc0\x02\n\x12TrackPosesResponse\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x0c\n\x04t_us\x18\x02 \x01(\x03\x12\x32\n\x0eT_world_camera\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12,\n\ncovariance\x18\x04 \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12:\n\x06status\x18\x05 \x01(\x0e\x32*.roel_service.v1.TrackPosesResponse.Status\x12\x0b\n\x03seq\x18\x06 \x01(\x03\"\\\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x13\n\x0fSTATUS_TRACKING\x10\x01\x12\x14\n\x10STATUS_UNCERTAIN\x10\x02\x12\x0f\n\x0bSTATUS_LOST\x10\x03\x32\xaf\x03\n\x13LocalizationService\x12O\n\x08Localize\x12 .roel_service.v1.LocalizeRequest\x1a!.roel_service.v1.LocalizeResponse\x12\x65\n\x0eStreamLocalize\x12&.roel_service.v1.StreamLocalizeRequest\x1a\'.roel_service.v1.StreamLocalizeResponse(\x01\x30\x01\x12\x84\x01\n\rBatchLocalize\x12%.roel_service.v1.BatchLocalizeRequest\x1a\x1d.google.longrunning.Operation\"-\xca\x41*\n\x15\x42\x61tchLocalizeResponse\x12\x11OperationMetadata\x12Y\n\nTrackPoses\x12\".roel_service.v1.TrackPosesRequest\x1a#.roel_service.v1.TrackPosesResponse(\x01\x30\x01\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/localization.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x17google/rpc/status.proto\x1a\x1croel_service/v1/config.proto\x1a\x1croel_service/v1/events.proto\x1a\x1broel_service/v1/types.proto\"\xed\x03\n\x0fLocalizeRequest\x12\x1a\n\x0cmap_versions\x18\x01 \x03(\tB\x04\xe2\x41\x01\x02\x12\x15\n\x05image\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x01H\x00\x12\x34\n\nimage_blob\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01H\x00\x12/\n\x05prior\x18\x04 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\x12\"\n\x14max_hypothesis_count\x18\x05 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x30\n\x08up_world\x18\x06 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x33\n\x0bup_panorama\x18\x07 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x1a\n\x0cup_sigma_deg\x18\x08 \x01(\x01\x42\x04\xe2\x41\x01\x01\x12-\n\x06\x63\x61mera\x18\t \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x01\x12\x14\n\x06preset\x18\n \x01(\tB\x04\xe2\x41\x01\x01\x12\x12\n\x04seed\x18\x0b \x01(\x03\x42\x04\xe2\x41\x01\x01\x12\x35\n\x06\x63onfig\x18\x0c \x01(\x0b\x32\x1f.roel_service.v1.LocalizeConfigB\x04\xe2\x41\x01\x01\x42\t\n\x07picture\"\xe7\x03\n\x10LocalizeResponse\x12\x38\n\x06status\x18\x01 \x01(\x0e\x32(.roel_service.v1.LocalizeResponse.Status\x12\x0e\n\x06reason\x18\x02 \x01(\t\x12\x33\n\nhypotheses\x18\x03 \x03(\x0b\x32\x1f.roel_service.v1.PoseHypothesis\x12=\n\x0b\x64iagnostics\x18\x04 \x01(\x0b\x32(.roel_service.v1.LocalizationDiagnostics\x12J\n\rstage_seconds\x18\x05 \x03(\x0b\x32\x33.roel_service.v1.LocalizeResponse.StageSecondsEntry\x12\x0f\n\x07seconds\x18\x06 \x01(\x01\x12\r\n\x05score\x18\x07 \x01(\x01\x12\x14\n\x0cmap_versions\x18\x08 \x03(\t\x1a\x33\n\x11StageSecondsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\"^\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x10\n\x0cSTATUS_FOUND\x10\x01\x12\x14\n\x10STATUS_AMBIGUOUS\x10\x02\x12\x14\n\x10STATUS_NOT_FOUND\x10\x03\"\xc4\x01\n\x0ePoseHypothesis\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x34\n\x10T_world_panorama\x18\x02 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05score\x18\x03 \x01(\x01\x12,\n\ncovariance\x18\x04 \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12\x14\n\x0c\x65xplained_2d\x18\x05 \x01(\x01\x12\x14\n\x0c\x65xplained_3d\x18\x06 \x01(\x01\"\x98\x01\n\x17LocalizationDiagnostics\x12\r\n\x05\x66lags\x18\x01 \x03(\t\x12\x11\n\tarc_count\x18\x02 \x01(\x03\x12\x16\n\x0erotation_count\x18\x03 \x01(\x03\x12\x17\n\x0f\x63\x61ndidate_count\x18\x04 \x01(\x03\x12\x17\n\x0frunner_up_ratio\x18\x05 \x01(\x01\x12\x11\n\tambiguity\x18\x06 \x01(\t\"\x85\x01\n\x15StreamLocalizeRequest\x12\x31\n\x05setup\x18\x01 \x01(\x0b\x32 .roel_service.v1.LocalizeRequestH\x00\x12\x31\n\x07picture\x18\x02 \x01(\x0b\x32\x1e.roel_service.v1.StreamPictureH\x00\x42\x06\n\x04part\"o\n\rStreamPicture\x12\x18\n\npicture_id\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x13\n\x05image\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\x12/\n\x05prior\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\"\xc8\x01\n\x16StreamLocalizeResponse\x12\x12\n\npicture_id\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.LocalizeResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x12\x33\n\x08\x61\x63\x63\x65pted\x18\x04 \x01(\x0b\x32\x1f.roel_service.v1.StreamAcceptedH\x00\x42\t\n\x07outcome\"?\n\x0eStreamAccepted\x12\x14\n\x0cmap_versions\x18\x01 \x03(\t\x12\x17\n\x0f\x63redit_pictures\x18\x02 \x01(\x03\"\xb2\x01\n\x14\x42\x61tchLocalizeRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x08requests\x18\x02 \x03(\x0b\x32 .roel_service.v1.LocalizeRequestB\x04\xe2\x41\x01\x01\x12\x30\n\x08manifest\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"j\n\x15\x42\x61tchLocalizeResponse\x12\'\n\x05items\x18\x01 \x01(\x0b\x32\x18.roel_service.v1.BlobRef\x12\x12\n\nitem_count\x18\x02 \x01(\x03\x12\x14\n\x0c\x66\x61iled_count\x18\x03 \x01(\x03\"\x89\x01\n\x11\x42\x61tchLocalizeItem\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.LocalizeResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x42\t\n\x07outcome\"z\n\x11TrackPosesRequest\x12/\n\x05setup\x18\x01 \x01(\x0b\x32\x1e.roel_service.v1.TrackingSetupH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"\xbd\x01\n\rTrackingSetup\x12\x19\n\x0bmap_version\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12-\n\x06\x63\x61mera\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x38\n\x0eT_world_camera\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x02\x12\x12\n\x04t_us\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x14\n\x06preset\x18\x05 \x01(\tB\x04\xe2\x41\x01\x01\"\xc0\x02\n\x12TrackPosesResponse\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x0c\n\x04t_us\x18\x02 \x01(\x03\x12\x32\n\x0eT_world_camera\x18\x03 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12,\n\ncovariance\x18\x04 \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12:\n\x06status\x18\x05 \x01(\x0e\x32*.roel_service.v1.TrackPosesResponse.Status\x12\x0b\n\x03seq\x18\x06 \x01(\x03\"\\\n\x06Status\x12\x16\n\x12STATUS_UNSPECIFIED\x10\x00\x12\x13\n\x0fSTATUS_TRACKING\x10\x01\x12\x14\n\x10STATUS_UNCERTAIN\x10\x02\x12\x0f\n\x0bSTATUS_LOST\x10\x03\x32\xaf\x03\n\x13LocalizationService\x12O\n\x08Localize\x12 .roel_service.v1.LocalizeRequest\x1a!.roel_service.v1.LocalizeResponse\x12\x65\n\x0eStreamLocalize\x12&.roel_service.v1.StreamLocalizeRequest\x1a\'.roel_service.v1.StreamLocalizeResponse(\x01\x30\x01\x12\x84\x01\n\rBatchLocalize\x12%.roel_service.v1.BatchLocalizeRequest\x1a\x1d.google.longrunning.Operation\"-\xca\x41*\n\x15\x42\x61tchLocalizeResponse\x12\x11OperationMetadata\x12Y\n\nTrackPoses\x12\".roel_service.v1.TrackPosesRequest\x1a#.roel_service.v1.TrackPosesResponse(\x01\x30\x01\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -58,6 +59,8 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_LOCALIZEREQUEST'].fields_by_name['preset']._serialized_options = b'\342A\001\001'
   _globals['_LOCALIZEREQUEST'].fields_by_name['seed']._loaded_options = None
   _globals['_LOCALIZEREQUEST'].fields_by_name['seed']._serialized_options = b'\342A\001\001'
+  _globals['_LOCALIZEREQUEST'].fields_by_name['config']._loaded_options = None
+  _globals['_LOCALIZEREQUEST'].fields_by_name['config']._serialized_options = b'\342A\001\001'
   _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._loaded_options = None
   _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._serialized_options = b'8\001'
   _globals['_STREAMPICTURE'].fields_by_name['picture_id']._loaded_options = None
@@ -86,38 +89,40 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_TRACKINGSETUP'].fields_by_name['preset']._serialized_options = b'\342A\001\001'
   _globals['_LOCALIZATIONSERVICE'].methods_by_name['BatchLocalize']._loaded_options = None
   _globals['_LOCALIZATIONSERVICE'].methods_by_name['BatchLocalize']._serialized_options = b'\312A*\n\025BatchLocalizeResponse\022\021OperationMetadata'
-  _globals['_LOCALIZEREQUEST']._serialized_start=210
-  _globals['_LOCALIZEREQUEST']._serialized_end=648
-  _globals['_LOCALIZERESPONSE']._serialized_start=651
-  _globals['_LOCALIZERESPONSE']._serialized_end=1101
-  _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._serialized_start=954
-  _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._serialized_end=1005
-  _globals['_LOCALIZERESPONSE_STATUS']._serialized_start=1007
-  _globals['_LOCALIZERESPONSE_STATUS']._serialized_end=1101
-  _globals['_POSEHYPOTHESIS']._serialized_start=1104
-  _globals['_POSEHYPOTHESIS']._serialized_end=1300
-  _globals['_LOCALIZATIONDIAGNOSTICS']._serialized_start=1303
-  _globals['_LOCALIZATIONDIAGNOSTICS']._serialized_end=1455
-  _globals['_STREAMLOCALIZEREQUEST']._serialized_start=1458
-  _globals['_STREAMLOCALIZEREQUEST']._serialized_end=1591
-  _globals['_STREAMPICTURE']._serialized_start=1593
-  _globals['_STREAMPICTURE']._serialized_end=1704
-  _globals['_STREAMLOCALIZERESPONSE']._serialized_start=1707
-  _globals['_STREAMLOCALIZERESPONSE']._serialized_end=1854
-  _globals['_BATCHLOCALIZEREQUEST']._serialized_start=1857
-  _globals['_BATCHLOCALIZEREQUEST']._serialized_end=2035
-  _globals['_BATCHLOCALIZERESPONSE']._serialized_start=2037
-  _globals['_BATCHLOCALIZERESPONSE']._serialized_end=2143
-  _globals['_BATCHLOCALIZEITEM']._serialized_start=2146
-  _globals['_BATCHLOCALIZEITEM']._serialized_end=2283
-  _globals['_TRACKPOSESREQUEST']._serialized_start=2285
-  _globals['_TRACKPOSESREQUEST']._serialized_end=2407
-  _globals['_TRACKINGSETUP']._serialized_start=2410
-  _globals['_TRACKINGSETUP']._serialized_end=2599
-  _globals['_TRACKPOSESRESPONSE']._serialized_start=2602
-  _globals['_TRACKPOSESRESPONSE']._serialized_end=2922
-  _globals['_TRACKPOSESRESPONSE_STATUS']._serialized_start=2830
-  _globals['_TRACKPOSESRESPONSE_STATUS']._serialized_end=2922
-  _globals['_LOCALIZATIONSERVICE']._serialized_start=2925
-  _globals['_LOCALIZATIONSERVICE']._serialized_end=3356
+  _globals['_LOCALIZEREQUEST']._serialized_start=240
+  _globals['_LOCALIZEREQUEST']._serialized_end=733
+  _globals['_LOCALIZERESPONSE']._serialized_start=736
+  _globals['_LOCALIZERESPONSE']._serialized_end=1223
+  _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._serialized_start=1076
+  _globals['_LOCALIZERESPONSE_STAGESECONDSENTRY']._serialized_end=1127
+  _globals['_LOCALIZERESPONSE_STATUS']._serialized_start=1129
+  _globals['_LOCALIZERESPONSE_STATUS']._serialized_end=1223
+  _globals['_POSEHYPOTHESIS']._serialized_start=1226
+  _globals['_POSEHYPOTHESIS']._serialized_end=1422
+  _globals['_LOCALIZATIONDIAGNOSTICS']._serialized_start=1425
+  _globals['_LOCALIZATIONDIAGNOSTICS']._serialized_end=1577
+  _globals['_STREAMLOCALIZEREQUEST']._serialized_start=1580
+  _globals['_STREAMLOCALIZEREQUEST']._serialized_end=1713
+  _globals['_STREAMPICTURE']._serialized_start=1715
+  _globals['_STREAMPICTURE']._serialized_end=1826
+  _globals['_STREAMLOCALIZERESPONSE']._serialized_start=1829
+  _globals['_STREAMLOCALIZERESPONSE']._serialized_end=2029
+  _globals['_STREAMACCEPTED']._serialized_start=2031
+  _globals['_STREAMACCEPTED']._serialized_end=2094
+  _globals['_BATCHLOCALIZEREQUEST']._serialized_start=2097
+  _globals['_BATCHLOCALIZEREQUEST']._serialized_end=2275
+  _globals['_BATCHLOCALIZERESPONSE']._serialized_start=2277
+  _globals['_BATCHLOCALIZERESPONSE']._serialized_end=2383
+  _globals['_BATCHLOCALIZEITEM']._serialized_start=2386
+  _globals['_BATCHLOCALIZEITEM']._serialized_end=2523
+  _globals['_TRACKPOSESREQUEST']._serialized_start=2525
+  _globals['_TRACKPOSESREQUEST']._serialized_end=2647
+  _globals['_TRACKINGSETUP']._serialized_start=2650
+  _globals['_TRACKINGSETUP']._serialized_end=2839
+  _globals['_TRACKPOSESRESPONSE']._serialized_start=2842
+  _globals['_TRACKPOSESRESPONSE']._serialized_end=3162
+  _globals['_TRACKPOSESRESPONSE_STATUS']._serialized_start=3070
+  _globals['_TRACKPOSESRESPONSE_STATUS']._serialized_end=3162
+  _globals['_LOCALIZATIONSERVICE']._serialized_start=3165
+  _globals['_LOCALIZATIONSERVICE']._serialized_end=3596
 # @@protoc_insertion_point(module_scope)

@@ -25,10 +25,11 @@ _sym_db = _symbol_database.Default()
 from google.api import field_behavior_pb2 as google_dot_api_dot_field__behavior__pb2
 from google.longrunning import operations_pb2 as google_dot_longrunning_dot_operations__pb2
 from google.rpc import status_pb2 as google_dot_rpc_dot_status__pb2
+from roel_service.v1 import config_pb2 as roel__service_dot_v1_dot_config__pb2
 from roel_service.v1 import types_pb2 as roel__service_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/registration.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x17google/rpc/status.proto\x1a\x1broel_service/v1/types.proto\"\xd5\x03\n\x0fRegisterRequest\x12\x19\n\x0bmap_version\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12/\n\x06points\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.PointsB\x04\xe2\x41\x01\x01H\x00\x12/\n\x05\x63loud\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01H\x00\x12\"\n\x12target_map_version\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01H\x00\x12.\n\x04init\x18\x05 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\x12\x39\n\x06method\x18\x06 \x01(\x0e\x32#.roel_service.v1.RegistrationMethodB\x04\xe2\x41\x01\x01\x12\x1c\n\x0e\x65stimate_scale\x18\x07 \x01(\x08\x42\x04\xe2\x41\x01\x01\x12\x31\n\tup_source\x18\x08 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x31\n\tup_target\x18\t \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x12\n\x04seed\x18\n \x01(\x03\x42\x04\xe2\x41\x01\x01\x12\x14\n\x06preset\x18\x0b \x01(\tB\x04\xe2\x41\x01\x01\x42\x08\n\x06target\"\xea\x04\n\x10RegisterResponse\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x33\n\x0fT_target_source\x18\x02 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05scale\x18\x03 \x01(\x01\x12\x11\n\tconverged\x18\x04 \x01(\x08\x12\x13\n\x0bstop_reason\x18\x05 \x01(\t\x12:\n\x07verdict\x18\x06 \x01(\x0e\x32).roel_service.v1.RegisterResponse.Verdict\x12\x0f\n\x07\x66itness\x18\x07 \x01(\x01\x12\x0f\n\x07overlap\x18\x08 \x01(\x01\x12\x1a\n\rinlier_rmse_m\x18\t \x01(\x01H\x00\x88\x01\x01\x12-\n\x0binformation\x18\n \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12\x13\n\x0b\x65igenvalues\x18\x0b \x03(\x01\x12\x34\n\x0fweak_directions\x18\x0c \x03(\x0b\x32\x1b.roel_service.v1.Direction6\x12>\n\x0c\x61lternatives\x18\r \x03(\x0b\x32(.roel_service.v1.RegistrationAlternative\x12\x17\n\x0fiteration_count\x18\x0e \x01(\x03\x12\x0f\n\x07seconds\x18\x0f \x01(\x01\"e\n\x07Verdict\x12\x17\n\x13VERDICT_UNSPECIFIED\x10\x00\x12\x14\n\x10VERDICT_ACCEPTED\x10\x01\x12\x15\n\x11VERDICT_AMBIGUOUS\x10\x02\x12\x14\n\x10VERDICT_REJECTED\x10\x03\x42\x10\n\x0e_inlier_rmse_m\"\x1c\n\nDirection6\x12\x0e\n\x06values\x18\x01 \x03(\x01\"n\n\x17RegistrationAlternative\x12\x33\n\x0fT_target_source\x18\x01 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05scale\x18\x02 \x01(\x01\x12\x0f\n\x07\x66itness\x18\x03 \x01(\x01\"\xb2\x01\n\x14\x42\x61tchRegisterRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x08requests\x18\x02 \x03(\x0b\x32 .roel_service.v1.RegisterRequestB\x04\xe2\x41\x01\x01\x12\x30\n\x08manifest\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"j\n\x15\x42\x61tchRegisterResponse\x12\'\n\x05items\x18\x01 \x01(\x0b\x32\x18.roel_service.v1.BlobRef\x12\x12\n\nitem_count\x18\x02 \x01(\x03\x12\x14\n\x0c\x66\x61iled_count\x18\x03 \x01(\x03\"\x89\x01\n\x11\x42\x61tchRegisterItem\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.RegisterResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x42\t\n\x07outcome*\xd3\x01\n\x12RegistrationMethod\x12#\n\x1fREGISTRATION_METHOD_UNSPECIFIED\x10\x00\x12\x1c\n\x18REGISTRATION_METHOD_AUTO\x10\x01\x12\x1d\n\x19REGISTRATION_METHOD_POINT\x10\x02\x12\x1d\n\x19REGISTRATION_METHOD_PLANE\x10\x03\x12\x1c\n\x18REGISTRATION_METHOD_LINE\x10\x04\x12\x1e\n\x1aREGISTRATION_METHOD_GLOBAL\x10\x05\x32\xed\x01\n\x13RegistrationService\x12O\n\x08Register\x12 .roel_service.v1.RegisterRequest\x1a!.roel_service.v1.RegisterResponse\x12\x84\x01\n\rBatchRegister\x12%.roel_service.v1.BatchRegisterRequest\x1a\x1d.google.longrunning.Operation\"-\xca\x41*\n\x15\x42\x61tchRegisterResponse\x12\x11OperationMetadatab\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"roel_service/v1/registration.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x17google/rpc/status.proto\x1a\x1croel_service/v1/config.proto\x1a\x1broel_service/v1/types.proto\"\x8c\x04\n\x0fRegisterRequest\x12\x19\n\x0bmap_version\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12/\n\x06points\x18\x02 \x01(\x0b\x32\x17.roel_service.v1.PointsB\x04\xe2\x41\x01\x01H\x00\x12/\n\x05\x63loud\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01H\x00\x12\"\n\x12target_map_version\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01H\x00\x12.\n\x04init\x18\x05 \x01(\x0b\x32\x1a.roel_service.v1.TransformB\x04\xe2\x41\x01\x01\x12\x39\n\x06method\x18\x06 \x01(\x0e\x32#.roel_service.v1.RegistrationMethodB\x04\xe2\x41\x01\x01\x12\x1c\n\x0e\x65stimate_scale\x18\x07 \x01(\x08\x42\x04\xe2\x41\x01\x01\x12\x31\n\tup_source\x18\x08 \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x31\n\tup_target\x18\t \x01(\x0b\x32\x18.roel_service.v1.Vector3B\x04\xe2\x41\x01\x01\x12\x12\n\x04seed\x18\n \x01(\x03\x42\x04\xe2\x41\x01\x01\x12\x14\n\x06preset\x18\x0b \x01(\tB\x04\xe2\x41\x01\x01\x12\x35\n\x06\x63onfig\x18\x0c \x01(\x0b\x32\x1f.roel_service.v1.RegisterConfigB\x04\xe2\x41\x01\x01\x42\x08\n\x06target\"\xb6\x05\n\x10RegisterResponse\x12\x13\n\x0bmap_version\x18\x01 \x01(\t\x12\x33\n\x0fT_target_source\x18\x02 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05scale\x18\x03 \x01(\x01\x12\x11\n\tconverged\x18\x04 \x01(\x08\x12\x13\n\x0bstop_reason\x18\x05 \x01(\t\x12:\n\x07verdict\x18\x06 \x01(\x0e\x32).roel_service.v1.RegisterResponse.Verdict\x12\x0f\n\x07\x66itness\x18\x07 \x01(\x01\x12\x0f\n\x07overlap\x18\x08 \x01(\x01\x12\x1a\n\rinlier_rmse_m\x18\t \x01(\x01H\x00\x88\x01\x01\x12-\n\x0binformation\x18\n \x01(\x0b\x32\x18.roel_service.v1.Matrix6\x12\x13\n\x0b\x65igenvalues\x18\x0b \x03(\x01\x12\x34\n\x0fweak_directions\x18\x0c \x03(\x0b\x32\x1b.roel_service.v1.Direction6\x12>\n\x0c\x61lternatives\x18\r \x03(\x0b\x32(.roel_service.v1.RegistrationAlternative\x12\x17\n\x0fiteration_count\x18\x0e \x01(\x03\x12\x0f\n\x07seconds\x18\x0f \x01(\x01\x12\x11\n\tagreement\x18\x10 \x01(\x01\x12\x1a\n\x12target_map_version\x18\x11 \x01(\t\x12\x1b\n\x13preparation_seconds\x18\x12 \x01(\x01\"e\n\x07Verdict\x12\x17\n\x13VERDICT_UNSPECIFIED\x10\x00\x12\x14\n\x10VERDICT_ACCEPTED\x10\x01\x12\x15\n\x11VERDICT_AMBIGUOUS\x10\x02\x12\x14\n\x10VERDICT_REJECTED\x10\x03\x42\x10\n\x0e_inlier_rmse_m\"\x1c\n\nDirection6\x12\x0e\n\x06values\x18\x01 \x03(\x01\"}\n\x17RegistrationAlternative\x12\x33\n\x0fT_target_source\x18\x01 \x01(\x0b\x32\x1a.roel_service.v1.Transform\x12\r\n\x05scale\x18\x02 \x01(\x01\x12\x0f\n\x07\x66itness\x18\x03 \x01(\x01\x12\r\n\x05score\x18\x04 \x01(\x01\"\xb2\x01\n\x14\x42\x61tchRegisterRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x08requests\x18\x02 \x03(\x0b\x32 .roel_service.v1.RegisterRequestB\x04\xe2\x41\x01\x01\x12\x30\n\x08manifest\x18\x03 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"j\n\x15\x42\x61tchRegisterResponse\x12\'\n\x05items\x18\x01 \x01(\x0b\x32\x18.roel_service.v1.BlobRef\x12\x12\n\nitem_count\x18\x02 \x01(\x03\x12\x14\n\x0c\x66\x61iled_count\x18\x03 \x01(\x03\"\x89\x01\n\x11\x42\x61tchRegisterItem\x12\r\n\x05index\x18\x01 \x01(\x03\x12\x35\n\x08response\x18\x02 \x01(\x0b\x32!.roel_service.v1.RegisterResponseH\x00\x12#\n\x05\x65rror\x18\x03 \x01(\x0b\x32\x12.google.rpc.StatusH\x00\x42\t\n\x07outcome*\xd3\x01\n\x12RegistrationMethod\x12#\n\x1fREGISTRATION_METHOD_UNSPECIFIED\x10\x00\x12\x1c\n\x18REGISTRATION_METHOD_AUTO\x10\x01\x12\x1d\n\x19REGISTRATION_METHOD_POINT\x10\x02\x12\x1d\n\x19REGISTRATION_METHOD_PLANE\x10\x03\x12\x1c\n\x18REGISTRATION_METHOD_LINE\x10\x04\x12\x1e\n\x1aREGISTRATION_METHOD_GLOBAL\x10\x05\x32\xed\x01\n\x13RegistrationService\x12O\n\x08Register\x12 .roel_service.v1.RegisterRequest\x1a!.roel_service.v1.RegisterResponse\x12\x84\x01\n\rBatchRegister\x12%.roel_service.v1.BatchRegisterRequest\x1a\x1d.google.longrunning.Operation\"-\xca\x41*\n\x15\x42\x61tchRegisterResponse\x12\x11OperationMetadatab\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -57,6 +58,8 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_REGISTERREQUEST'].fields_by_name['seed']._serialized_options = b'\342A\001\001'
   _globals['_REGISTERREQUEST'].fields_by_name['preset']._loaded_options = None
   _globals['_REGISTERREQUEST'].fields_by_name['preset']._serialized_options = b'\342A\001\001'
+  _globals['_REGISTERREQUEST'].fields_by_name['config']._loaded_options = None
+  _globals['_REGISTERREQUEST'].fields_by_name['config']._serialized_options = b'\342A\001\001'
   _globals['_BATCHREGISTERREQUEST'].fields_by_name['parent']._loaded_options = None
   _globals['_BATCHREGISTERREQUEST'].fields_by_name['parent']._serialized_options = b'\342A\001\002'
   _globals['_BATCHREGISTERREQUEST'].fields_by_name['requests']._loaded_options = None
@@ -67,24 +70,24 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_BATCHREGISTERREQUEST'].fields_by_name['request_id']._serialized_options = b'\342A\001\001'
   _globals['_REGISTRATIONSERVICE'].methods_by_name['BatchRegister']._loaded_options = None
   _globals['_REGISTRATIONSERVICE'].methods_by_name['BatchRegister']._serialized_options = b'\312A*\n\025BatchRegisterResponse\022\021OperationMetadata'
-  _globals['_REGISTRATIONMETHOD']._serialized_start=1844
-  _globals['_REGISTRATIONMETHOD']._serialized_end=2055
-  _globals['_REGISTERREQUEST']._serialized_start=180
-  _globals['_REGISTERREQUEST']._serialized_end=649
-  _globals['_REGISTERRESPONSE']._serialized_start=652
-  _globals['_REGISTERRESPONSE']._serialized_end=1270
-  _globals['_REGISTERRESPONSE_VERDICT']._serialized_start=1151
-  _globals['_REGISTERRESPONSE_VERDICT']._serialized_end=1252
-  _globals['_DIRECTION6']._serialized_start=1272
-  _globals['_DIRECTION6']._serialized_end=1300
-  _globals['_REGISTRATIONALTERNATIVE']._serialized_start=1302
-  _globals['_REGISTRATIONALTERNATIVE']._serialized_end=1412
-  _globals['_BATCHREGISTERREQUEST']._serialized_start=1415
-  _globals['_BATCHREGISTERREQUEST']._serialized_end=1593
-  _globals['_BATCHREGISTERRESPONSE']._serialized_start=1595
-  _globals['_BATCHREGISTERRESPONSE']._serialized_end=1701
-  _globals['_BATCHREGISTERITEM']._serialized_start=1704
-  _globals['_BATCHREGISTERITEM']._serialized_end=1841
-  _globals['_REGISTRATIONSERVICE']._serialized_start=2058
-  _globals['_REGISTRATIONSERVICE']._serialized_end=2295
+  _globals['_REGISTRATIONMETHOD']._serialized_start=2020
+  _globals['_REGISTRATIONMETHOD']._serialized_end=2231
+  _globals['_REGISTERREQUEST']._serialized_start=210
+  _globals['_REGISTERREQUEST']._serialized_end=734
+  _globals['_REGISTERRESPONSE']._serialized_start=737
+  _globals['_REGISTERRESPONSE']._serialized_end=1431
+  _globals['_REGISTERRESPONSE_VERDICT']._serialized_start=1312
+  _globals['_REGISTERRESPONSE_VERDICT']._serialized_end=1413
+  _globals['_DIRECTION6']._serialized_start=1433
+  _globals['_DIRECTION6']._serialized_end=1461
+  _globals['_REGISTRATIONALTERNATIVE']._serialized_start=1463
+  _globals['_REGISTRATIONALTERNATIVE']._serialized_end=1588
+  _globals['_BATCHREGISTERREQUEST']._serialized_start=1591
+  _globals['_BATCHREGISTERREQUEST']._serialized_end=1769
+  _globals['_BATCHREGISTERRESPONSE']._serialized_start=1771
+  _globals['_BATCHREGISTERRESPONSE']._serialized_end=1877
+  _globals['_BATCHREGISTERITEM']._serialized_start=1880
+  _globals['_BATCHREGISTERITEM']._serialized_end=2017
+  _globals['_REGISTRATIONSERVICE']._serialized_start=2234
+  _globals['_REGISTRATIONSERVICE']._serialized_end=2471
 # @@protoc_insertion_point(module_scope)

@@ -32,6 +32,11 @@ def check_parent(parent: str) -> None:
         raise NotFoundError("parent", PROJECT, repr(parent))
 
 
+def is_resource_name(name: str) -> bool:
+    """Whether this names something that a server has; a file of such a name is `./projects/...`."""
+    return name.startswith(f"{PROJECT}/")
+
+
 def event_stream_name(event_stream_id: str) -> str:
     """The name of a recording."""
     return f"{PROJECT}/eventStreams/{event_stream_id}"

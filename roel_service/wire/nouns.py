@@ -1,11 +1,11 @@
-"""Cameras, trajectories and boxes as messages; `foo_to_proto` beside `foo_from_proto`."""
+"""Cameras, poses and boxes as messages; `foo_to_proto` beside `foo_from_proto`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray
-from roel_service.errors import CameraError, TrajectoryError
+from roel_service.arrays import Array, BoolArray, FloatArray
+from roel_service.errors import CameraError, InputError, TrajectoryError
 from roel_service.geometry.se3 import SE3
 from roel_service.scene.camera import Camera, CameraModel
 from roel_service.scene.trajectory import Trajectory
@@ -104,6 +104,52 @@ def bounds_from_proto(message: types_pb2.Bounds) -> tuple[FloatArray, FloatArray
     return lower_m, upper_m
 
 
+def transform_to_proto(T_target_source: SE3, target: str, source: str) -> types_pb2.Transform:
+    """One transform between two frames, all bits of it."""
+    return types_pb2.Transform(
+        target_frame=target,
+        source_frame=source,
+        translation_m=vector_to_proto(T_target_source.translation),
+        rotation=T_target_source.rotation.ravel().tolist(),
+    )
+
+
+def transform_from_proto(message: types_pb2.Transform, subject: str) -> SE3:
+    """One transform; its frames are for people.
+
+    Raises:
+        InputError: no rotation within `ROTATION_TOLERANCE`, or a translation that is not finite.
+    """
+    translation = vector_from_proto(message.translation_m)
+    if len(message.rotation) != 9 or not np.isfinite(translation).all():
+        found = f"{len(message.rotation)} numbers and {translation.tolist()}"
+        raise InputError(subject, "9 numbers of a rotation and a finite translation", found)
+    rotation = np.array(message.rotation).reshape(3, 3)
+    if not _is_rotation(rotation):
+        raise InputError(subject, "a rotation matrix", f"{rotation.tolist()}")
+    return SE3(rotation=rotation, translation=translation)
+
+
+def vector_to_proto(vector: FloatArray) -> types_pb2.Vector3:
+    """From (3,)."""
+    return types_pb2.Vector3(x=vector[0], y=vector[1], z=vector[2])
+
+
+def vector_from_proto(message: types_pb2.Vector3) -> FloatArray:
+    """(3,), finite or not."""
+    return np.array([message.x, message.y, message.z])
+
+
+def matrix6_to_proto(matrix: FloatArray) -> types_pb2.Matrix6:
+    """From (6, 6)."""
+    return types_pb2.Matrix6(values=matrix.ravel().tolist())
+
+
+def matrix6_from_proto(message: types_pb2.Matrix6) -> FloatArray:
+    """(6, 6)."""
+    return np.array(message.values).reshape(6, 6)
+
+
 def _bytes(values: Array, dtype: str) -> bytes:
     return np.ascontiguousarray(values, dtype=dtype).tobytes()
 
@@ -124,10 +170,15 @@ def _check_finite(translation: FloatArray, name: str) -> None:
 
 
 def _check_rotations(rotation: FloatArray) -> None:
-    # NaN compares as False, so the accepting comparison refuses it. Rows far off overflow quietly.
-    with np.errstate(over="ignore", invalid="ignore"):
-        deviation = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max(axis=(1, 2))
-        proper = (deviation <= ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    proper = _is_rotation(rotation)
     if not proper.all():
         index = int(np.argmin(proper))
         raise TrajectoryError("poses", "rotation matrices", f"none at pose {index}")
+
+
+def _is_rotation(rotation: FloatArray) -> BoolArray:
+    """(*B,) which of (*B, 3, 3) are rotations."""
+    # NaN compares as False, so the accepting comparison refuses it. Rows far off overflow quietly.
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(np.swapaxes(rotation, -1, -2) @ rotation - np.eye(3)).max(axis=(-2, -1))
+        return np.asarray((deviation <= ROTATION_TOLERANCE) & (np.linalg.det(rotation) > 0))

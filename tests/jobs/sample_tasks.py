@@ -153,3 +153,14 @@ def wait_for(parameters, tell):
 def preview_then_wait(parameters, tell):
     tell(Partial(result=build_nothing(None, tell)))
     wait(None, tell)
+
+
+class Tally:
+    """Keeps what it was told."""
+
+    def __init__(self):
+        self.told = []
+
+    def __call__(self, parameters, tell):
+        self.told.append(parameters)
+        return list(self.told)

@@ -191,6 +191,16 @@ def test_a_warm_child_keeps_its_process_between_calls():
     assert len(using(warm, scenario)) == 1
 
 
+def test_a_warm_child_makes_one_object_of_a_class_and_a_new_child_another():
+    async def scenario(executor):
+        told = [await executor.run(spec("Tally", number), ignore) for number in (1, 2)]
+        with pytest.raises(FaultError):
+            await executor.run(spec("fail"), ignore)
+        return [*told, await executor.run(spec("Tally", 3), ignore)]
+
+    assert using(warm, scenario) == [[1], [1, 2], [3]]
+
+
 def test_a_warm_child_is_replaced_before_it_grows_old(monkeypatch):
     monkeypatch.setattr(warming, "MAX_CALL_COUNT", 1)
 

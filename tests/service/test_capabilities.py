@@ -1,15 +1,11 @@
+import asyncio
+
 import pytest
 
 from roel_service.errors import UnimplementedError
+from roel_service.service.methods import complete
 from roel_service.service.services import SERVICES
-from roel_service.v1 import (
-    localization_pb2,
-    localization_pb2_grpc,
-    registration_pb2,
-    registration_pb2_grpc,
-)
-
-NAME = "projects/default/maps/house/versions/latest"
+from roel_service.v1 import maps_pb2
 
 
 @pytest.fixture(scope="module")
@@ -42,18 +38,20 @@ def test_every_service_is_listed_with_its_methods(implemented):
     assert {name.partition("/")[0] for name in implemented} == set(SERVICES)
     assert list(implemented) == sorted(implemented)
     assert implemented["roel_service.v1.MapService/GetMap"]
-    assert not implemented["roel_service.v1.RegistrationService/Register"]
 
 
-def test_a_method_that_is_only_planned_says_so(connection, implemented):
-    stub = registration_pb2_grpc.RegistrationServiceStub(connection.channel)
-    with pytest.raises(UnimplementedError, match="RegistrationService/Register") as caught:
-        connection.call(stub.Register, registration_pb2.RegisterRequest(map_version=NAME))
+@pytest.fixture
+def planned():
+    """A service of which nobody wrote a method yet."""
+    return complete(maps_pb2.DESCRIPTOR.services_by_name["MapService"], object())
+
+
+def test_a_method_that_is_only_planned_says_so(planned):
+    with pytest.raises(UnimplementedError, match="MapService/GetMap") as caught:
+        asyncio.run(planned.GetMap(None, None))
     assert caught.value.reason == "METHOD_NOT_IMPLEMENTED"
 
 
-def test_a_stream_that_is_only_planned_says_so(connection):
-    stub = localization_pb2_grpc.LocalizationServiceStub(connection.channel)
-    requests = iter([localization_pb2.TrackPosesRequest()])
-    with pytest.raises(UnimplementedError, match="LocalizationService/TrackPoses"):
-        list(connection.stream(stub.TrackPoses, requests))
+def test_a_stream_that_is_only_planned_says_so(planned):
+    with pytest.raises(UnimplementedError, match="MapService/ExportMap"):
+        asyncio.run(anext(planned.ExportMap(None, None)))

@@ -15,7 +15,14 @@ LIST = "/roel_service.v1.MapService/ListMaps"
 APPEND = "/roel_service.v1.EventStreamService/AppendEvents"
 POSES = "/roel_service.v1.EventStreamService/AppendPoses"
 WATCH = "/roel_service.v1.OperationService/WatchOperation"
-SETTINGS = Settings(calls_in_flight=1, calls_waiting=1, open_uploads=1)
+REGISTER = "/roel_service.v1.RegistrationService/Register"
+SETTINGS = Settings(
+    calls_in_flight=1,
+    calls_waiting=1,
+    open_uploads=1,
+    interactive_workers=1,
+    interactive_queued=0,
+)
 
 
 class Work:
@@ -85,6 +92,19 @@ def test_all_uploads_share_one_limit():
                 await work.start(POSES)
             work.end.set()
             await asyncio.gather(*uploads)
+
+    asyncio.run(main())
+
+
+def test_questions_have_as_many_places_as_children():
+    async def main():
+        async with working(CallLimits(SETTINGS)) as work:
+            question = work.start(REGISTER)
+            await settled()
+            with pytest.raises(LimitError):
+                await work.start(REGISTER)
+            work.end.set()
+            await question
 
     asyncio.run(main())
 

@@ -16,10 +16,10 @@ from roel_client.cli.parser import (
     one_of,
 )
 from roel_client.cli.staging import Staged
-from roel_client.naming import naming
 from roel_service.config.load import Tables, load_config, to_toml
 from roel_service.config.presets import PRESETS
 from roel_service.config.stages import Config
+from roel_service.naming import naming
 
 
 def add_commands(subparsers: Subparsers) -> None:

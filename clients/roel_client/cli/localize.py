@@ -9,6 +9,8 @@ from typing import Any
 from roel_client.cli.configuration import effective_config
 from roel_client.cli.output import print_result
 from roel_client.cli.parser import Command, Subparsers, UsageError, command, one_of
+from roel_client.cli.process import interruptible
+from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
 from roel_service.errors import NoAnswerError
 
@@ -52,6 +54,7 @@ def add_commands(subparsers: Subparsers) -> None:
     parser.add_argument("--overlay", metavar="DIR", help="pictures with the map's lines over them")
     parser.add_argument("--strict", action="store_true", help="end with 3 unless all are FOUND")
     parser.add_argument("--json", action="store_true", help="print as JSON, one line a panorama")
+    add_server_options(parser, required=False, what="let this server locate the panoramas")
 
 
 def localize(options: argparse.Namespace, staged: Staged) -> None:
@@ -60,13 +63,25 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
 
     if options.preset == "paper":
         raise UsageError("--preset", "default, the one preset of localization so far", "paper")
-    documents: Iterable[dict[str, Any]] = local.localize_panoramas(
-        [options.map, *options.more_maps],
-        options.panoramas,
-        prior=options.prior,
-        config=effective_config(options).localize,
-        overlay=staged.get("overlay"),
-    )
+    maps = [options.map, *options.more_maps]
+    asked: dict[str, Any] = {
+        "prior": options.prior,
+        "config": effective_config(options).localize,
+        "overlay": staged.get("overlay"),
+    }
+    if options.server is None:
+        report(local.localize_panoramas(maps, options.panoramas, **asked), options)
+        return
+    server = {"server": options.server, "options": server_options(options)}
+    # A signal must reach the client, which then takes what it hosted away.
+    with interruptible():
+        report(
+            local.localize_panoramas_remotely(maps, options.panoramas, **asked, **server), options
+        )
+
+
+def report(documents: Iterable[dict[str, Any]], options: argparse.Namespace) -> None:
+    """Print each document as it comes; with --strict raise `NoAnswerError` unless all are FOUND."""
     if options.strict and not options.json:
         # Without an answer for all, nothing goes to stdout.
         documents = list(documents)

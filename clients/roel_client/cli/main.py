@@ -37,6 +37,7 @@ from roel_client.cli.process import Interrupted, ignore_signals, interruptible, 
 from roel_client.cli.staging import NamedFiles, publish, staging
 from roel_service import __version__
 from roel_service.errors import Cancelled, NoAnswerError, RoelError
+from roel_service.wire.names import is_resource_name
 
 DONE, BUG, UNUSABLE, NO_ANSWER = 0, 1, 2, 3
 
@@ -168,13 +169,14 @@ def log_level(options: argparse.Namespace) -> str:
 
 def named_files(command: Command, options: argparse.Namespace) -> NamedFiles:
     """The files and folders that the user named."""
+    has_server = getattr(options, "server", None) is not None
 
     def given(names: tuple[str, ...]) -> dict[str, str]:
         found = {}
         for name in names:
             value = getattr(options, name)
             for index, item in enumerate(value if isinstance(value, list) else [value]):
-                if item is not None:
+                if item is not None and not (has_server and is_resource_name(item)):
                     found[f"{name}[{index}]" if index else name] = item
         return found
 

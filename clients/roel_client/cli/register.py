@@ -8,6 +8,8 @@ from typing import Any
 from roel_client.cli.configuration import effective_config
 from roel_client.cli.output import print_result
 from roel_client.cli.parser import Command, Subparsers, UsageError, command, one_of, suffixed
+from roel_client.cli.process import interruptible
+from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
 from roel_service.errors import NoAnswerError
 
@@ -39,6 +41,7 @@ def add_commands(subparsers: Subparsers) -> None:
         "--strict", action="store_true", help="end with 3 unless the verdict is ACCEPTED"
     )
     parser.add_argument("--json", action="store_true", help="print as JSON")
+    add_server_options(parser, required=False, what="let this server register the map")
     parser.set_defaults(preset="default")
 
 
@@ -48,14 +51,19 @@ def register(options: argparse.Namespace, staged: Staged) -> None:
 
     if options.method == "global" and options.init is not None:
         raise UsageError("--init", "no first guess with --method global", options.init)
-    found = local.register_map(
-        options.map,
-        options.cloud,
-        init=options.init,
-        method=options.method,
-        config=effective_config(options).register,
-        plot=staged.get("plot"),
-    )
+    asked: dict[str, Any] = {
+        "init": options.init,
+        "method": options.method,
+        "config": effective_config(options).register,
+        "plot": staged.get("plot"),
+    }
+    if options.server is None:
+        found = local.register_map(options.map, options.cloud, **asked)
+    else:
+        server = {"server": options.server, "options": server_options(options)}
+        # A signal must reach the client, which then takes what it hosted away.
+        with interruptible():
+            found = local.register_map_remotely(options.map, options.cloud, **asked, **server)
     if options.strict and found["verdict"] != ACCEPTED:
         raise NoAnswerError(
             options.map,

@@ -1,0 +1,55 @@
+"""Answers to `LocalizeQuestion`, in a child."""
+
+from __future__ import annotations
+
+import time
+
+from roel_service.io.images import decode_panorama
+from roel_service.jobs.preparations import Form, Origin, Preparations
+from roel_service.jobs.questions import LocalizeQuestion, MapFile, StoredFile
+from roel_service.pano_loc.localize import localize_panorama
+from roel_service.pano_loc.prepare import PreparedMap, prepare_map
+from roel_service.v1 import localization_pb2
+from roel_service.wire.localization import localization_to_proto
+
+SUBJECT = "image"
+
+_PREPARED_MAP = Form(PreparedMap.to_arrays, PreparedMap.from_arrays)
+
+
+def answer(
+    question: LocalizeQuestion, preparations: Preparations
+) -> localization_pb2.LocalizeResponse:
+    """Where the picture was taken; a map that was met before is not prepared again.
+
+    Raises:
+        PanoramaError: no picture that can be used.
+        CorruptionError: a file that is not what its digest says.
+    """
+    start_s = time.perf_counter()
+    grey = decode_panorama(_bytes(question.image), SUBJECT)
+    decoded_s = time.perf_counter()
+    maps = [_prepared(file, question, preparations) for file in question.maps]
+    prepared_s = time.perf_counter()
+    result = localize_panorama(
+        grey, maps, question.config, prior=question.prior, gravity=question.gravity
+    )
+    end_s = time.perf_counter()
+    names = [file.name for file in question.maps]
+    message = localization_to_proto(result, names, question.max_hypothesis_count)
+    message.stage_seconds["decode"] = decoded_s - start_s
+    message.stage_seconds["prepare"] = prepared_s - decoded_s
+    message.stage_seconds["localize"] = message.seconds = end_s - prepared_s
+    return message
+
+
+def _bytes(image: StoredFile | bytes) -> bytes:
+    return image if isinstance(image, bytes) else image.read()
+
+
+def _prepared(file: MapFile, question: LocalizeQuestion, preparations: Preparations) -> PreparedMap:
+    config = question.config
+    origin = Origin(kind="localize_map", sha256=file.sha256, parameters=config)
+    return preparations.of(
+        origin, lambda: prepare_map(file.line_map(), config), question.cache, _PREPARED_MAP
+    )

@@ -1,0 +1,283 @@
+"""What registration and localization are asked, with every file that they need named.
+
+The front makes questions of requests; a child answers them without looking anything up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from roel_service.arrays import FloatArray
+from roel_service.config.stages import LocalizeConfig, RegisterConfig
+from roel_service.errors import CorruptionError, InputError, LimitError
+from roel_service.geometry.se3 import SE3
+from roel_service.jobs.inputs import CachePlace
+from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
+from roel_service.scene.lines import LineMap
+from roel_service.store.maps import Maps
+from roel_service.v1 import config_pb2, localization_pb2, registration_pb2, types_pb2
+from roel_service.wire import names
+from roel_service.wire.configs import config_from_proto
+from roel_service.wire.nouns import transform_from_proto, vector_from_proto
+from roel_service.wire.registration import METHODS
+from roel_service.wire.rlm import decode_map
+
+DEFAULT_PRESET = "default"
+BYTES_PER_POINT = 12
+MAX_HYPOTHESIS_COUNT = 5
+MAX_UP_SIGMA_DEG = 90.0
+UNIT_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredFile:
+    """Bytes named by their digest.
+
+    Attributes:
+        name: what answers and errors call them.
+        sha256: hexadecimal digest.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+
+    def read(self) -> bytes:
+        """The bytes; raises `CorruptionError` unless they are what the digest says."""
+        data = self.path.read_bytes()
+        _check_digest(self, hashlib.sha256(data).hexdigest())
+        return data
+
+    def checked_path(self) -> Path:
+        """Where they are, for a reader of files; raises as `read`."""
+        with self.path.open("rb") as file:
+            _check_digest(self, hashlib.file_digest(file, "sha256").hexdigest())
+        return self.path
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFile(StoredFile):
+    """The map file of a version."""
+
+    def line_map(self) -> LineMap:
+        """Its lines; raises as `read`."""
+        return decode_map(self.read(), subject=self.name).line_map
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RegisterQuestion:
+    """A map to be laid over something.
+
+    Attributes:
+        target: another map, an uploaded cloud, or float32 points (N, 3), m, as bytes.
+        T_init: first T_target_source; None: the identity.
+        cache: where prepared targets are kept.
+    """
+
+    source: MapFile
+    target: MapFile | StoredFile | bytes
+    T_init: SE3 | None
+    method: str
+    config: RegisterConfig
+    cache: CachePlace | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalizeQuestion:
+    """A picture to be found in one of a few maps.
+
+    Attributes:
+        image: an encoded picture, uploaded or as it came.
+        max_hypothesis_count: of those in the answer.
+        cache: where prepared maps are kept.
+    """
+
+    maps: tuple[MapFile, ...]
+    image: StoredFile | bytes
+    prior: PosePrior | None
+    gravity: Gravity | None
+    max_hypothesis_count: int
+    config: LocalizeConfig
+    cache: CachePlace | None
+
+
+Question = RegisterQuestion | LocalizeQuestion
+
+
+class Questions:
+    """Makes questions of requests.
+
+    Args:
+        maps: where versions are looked up.
+        blob_path: where an uploaded blob lies; raises `NotFoundError`.
+        cache: where prepared inputs are kept.
+        inline_point_count: most points of a cloud in a request.
+    """
+
+    def __init__(
+        self,
+        maps: Maps,
+        blob_path: Callable[[str], Path],
+        cache: CachePlace | None,
+        inline_point_count: int,
+    ) -> None:
+        self._maps = maps
+        self._blob_path = blob_path
+        self._cache = cache
+        self._inline_point_count = inline_point_count
+
+    def registration(self, request: registration_pb2.RegisterRequest) -> RegisterQuestion:
+        """A request of Register.
+
+        Raises:
+            InputError: a field that cannot be used.
+            ConfigError: an unknown preset, or a value out of range.
+            LimitError: too many points.
+            NotFoundError, StateError: a version or blob that is not there, or not usable.
+        """
+        _refuse_gravity(request)
+        method = _method(request)
+        return RegisterQuestion(
+            source=self._map_file(request.map_version),
+            target=self._target(request),
+            T_init=transform_from_proto(request.init, "init") if request.HasField("init") else None,
+            method=method,
+            config=_register_config(request),
+            cache=self._cache,
+        )
+
+    def localization(self, request: localization_pb2.LocalizeRequest) -> LocalizeQuestion:
+        """A request of Localize; raises as `registration`."""
+        return dataclasses.replace(self.search(request), image=self._image(request))
+
+    def search(self, request: localization_pb2.LocalizeRequest) -> LocalizeQuestion:
+        """Where and how to look, for any picture; raises as `registration`."""
+        if request.HasField("camera"):
+            raise InputError("camera", "none: pictures are panoramas", "one")
+        tables = config_pb2.MappingConfig(localize=request.config)
+        config = config_from_proto(tables, request.preset or DEFAULT_PRESET).localize
+        return LocalizeQuestion(
+            maps=self._map_files(request.map_versions),
+            image=b"",
+            prior=pose_prior(request.prior) if request.HasField("prior") else None,
+            gravity=_gravity(request),
+            max_hypothesis_count=_hypothesis_count(request, config),
+            config=config,
+            cache=self._cache,
+        )
+
+    def _map_files(self, map_versions: Sequence[str]) -> tuple[MapFile, ...]:
+        if not 1 <= len(map_versions) <= MAX_MAP_COUNT:
+            expected = f"1 to {MAX_MAP_COUNT} versions"
+            raise InputError("map_versions", expected, f"{len(map_versions)}")
+        files = {file.name: file for file in map(self._map_file, map_versions)}
+        return tuple(files.values())
+
+    def _image(self, request: localization_pb2.LocalizeRequest) -> StoredFile | bytes:
+        kind = request.WhichOneof("picture")
+        if kind is None:
+            raise InputError("picture", "image or image_blob", "none")
+        return request.image if kind == "image" else self._blob(request.image_blob, "image")
+
+    def _target(self, request: registration_pb2.RegisterRequest) -> MapFile | StoredFile | bytes:
+        kind = request.WhichOneof("target")
+        if kind == "points":
+            return self._points(request.points)
+        if kind == "cloud":
+            return self._blob(request.cloud, "cloud")
+        if kind == "target_map_version":
+            return self._map_file(request.target_map_version)
+        raise InputError("target", "points, cloud or target_map_version", "none")
+
+    def _points(self, message: types_pb2.Points) -> bytes:
+        count, rest = divmod(len(message.points_m), BYTES_PER_POINT)
+        if rest:
+            found = f"{len(message.points_m)} bytes"
+            raise InputError("points", f"rows of {BYTES_PER_POINT} bytes", found)
+        if count > self._inline_point_count:
+            expected = f"at most {self._inline_point_count} points (upload more as a blob)"
+            raise LimitError("points", expected, f"{count}")
+        return bytes(message.points_m)
+
+    def _map_file(self, name: str) -> MapFile:
+        record = self._maps.version(*names.map_version_id(name))
+        path = self._maps.map_path(record)
+        found = names.map_version_name(record.map_id, record.version)
+        return MapFile(name=found, path=path, sha256=record.sha256)
+
+    def _blob(self, message: types_pb2.BlobRef, name: str) -> StoredFile:
+        sha256 = names.checked_sha256(message.sha256)
+        return StoredFile(name=name, path=self._blob_path(sha256), sha256=sha256)
+
+
+def _check_digest(file: StoredFile, found: str) -> None:
+    if found != file.sha256:
+        raise CorruptionError(file.name, f"bytes of digest {file.sha256}", found)
+
+
+def _method(request: registration_pb2.RegisterRequest) -> str:
+    if not 0 <= request.method < len(METHODS):
+        expected = f"one of {', '.join(dict.fromkeys(METHODS))}"
+        raise InputError("method", expected, f"{request.method}")
+    method = METHODS[request.method]
+    if method == "global" and request.HasField("init"):
+        raise InputError("init", "no first guess with method GLOBAL", "one")
+    return method
+
+
+def _register_config(request: registration_pb2.RegisterRequest) -> RegisterConfig:
+    tables = config_pb2.MappingConfig(register=request.config)
+    config = config_from_proto(tables, request.preset or DEFAULT_PRESET).register
+    if not request.estimate_scale:
+        return config
+    return dataclasses.replace(config, estimate_scale=True)
+
+
+def pose_prior(message: types_pb2.Transform) -> PosePrior:
+    """About where a picture was taken; raises `InputError`."""
+    return PosePrior(T_world_picture=transform_from_proto(message, "prior"))
+
+
+def _gravity(request: localization_pb2.LocalizeRequest) -> Gravity | None:
+    given = [name for name in ("up_world", "up_panorama") if request.HasField(name)]
+    if not given:
+        return None
+    if len(given) == 1:
+        raise InputError("up_world", "up_world and up_panorama together", f"{given[0]} alone")
+    up_world, up_picture = (_direction(getattr(request, name), name) for name in given)
+    if not 0.0 <= request.up_sigma_deg <= MAX_UP_SIGMA_DEG:
+        expected = f"0 to {MAX_UP_SIGMA_DEG:.0f} degrees"
+        raise InputError("up_sigma_deg", expected, f"{request.up_sigma_deg}")
+    if request.up_sigma_deg == 0.0:
+        return Gravity(up_world=up_world, up_picture=up_picture)
+    sigma_rad = math.radians(request.up_sigma_deg)
+    return Gravity(up_world=up_world, up_picture=up_picture, sigma_rad=sigma_rad)
+
+
+def _direction(message: types_pb2.Vector3, name: str) -> FloatArray:
+    """(3,) of a length that is about 1."""
+    direction = vector_from_proto(message)
+    length = math.hypot(*direction)
+    # Comparing like this refuses NaN.
+    if not abs(length - 1.0) <= UNIT_TOLERANCE:
+        raise InputError(name, "a unit vector", f"one of length {length:g}")
+    return direction
+
+
+def _hypothesis_count(request: localization_pb2.LocalizeRequest, config: LocalizeConfig) -> int:
+    if not 0 <= request.max_hypothesis_count <= MAX_HYPOTHESIS_COUNT:
+        expected = f"0 to {MAX_HYPOTHESIS_COUNT}"
+        raise InputError("max_hypothesis_count", expected, f"{request.max_hypothesis_count}")
+    return request.max_hypothesis_count or config.max_hypothesis_count
+
+
+def _refuse_gravity(request: registration_pb2.RegisterRequest) -> None:
+    for name in ("up_source", "up_target"):
+        if request.HasField(name):
+            expected = "none: z is vertical on both sides unless config.gravity_aligned is false"
+            raise InputError(name, expected, "a direction")

@@ -1,0 +1,25 @@
+"""RegistrationService: maps are laid over clouds and other maps."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from roel_service.jobs.questions import Questions
+from roel_service.service.asking import Asking
+from roel_service.v1 import registration_pb2
+
+
+class RegistrationServicer:
+    """Makes questions of requests, and has them answered."""
+
+    def __init__(self, questions: Questions, asking: Asking) -> None:
+        self._questions = questions
+        self._asking = asking
+
+    async def Register(
+        self, request: registration_pb2.RegisterRequest, context: Any
+    ) -> registration_pb2.RegisterResponse:
+        question = await asyncio.to_thread(self._questions.registration, request)
+        answer = await self._asking.answer(question)
+        return registration_pb2.RegisterResponse.FromString(answer)
