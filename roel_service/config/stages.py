@@ -322,8 +322,9 @@ class RefineConfig(Stage, table="refine"):
         pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
         pose_interval_us: control points of the poses' correction are so far apart.
         pose_noise_px: noise of an observation as a whole, against the drift of the poses.
-        pose_drift_deg, pose_drift_m, pose_drift_s: how far the given poses wander off, standard
-            deviations, and the time after which they have forgotten it.
+        pose_drift_deg, pose_drift_m: how far the given poses are expected to wander off, standard
+            deviations; how far they did is learned from there.
+        pose_drift_s: the time after which they have forgotten it.
     """
 
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
@@ -342,7 +343,7 @@ class RefineConfig(Stage, table="refine"):
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.5, 2.0, 1.5, 1.3), SOME_POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)
     pose_interval_us: int = parameter(100_000, POSITIVE)
-    pose_noise_px: float = parameter(0.5, POSITIVE)
+    pose_noise_px: float = parameter(0.35, POSITIVE)
     pose_drift_deg: float = parameter(0.25, POSITIVE)
     pose_drift_m: float = parameter(0.005, POSITIVE)
     pose_drift_s: float = parameter(1.5, POSITIVE)

@@ -5,6 +5,7 @@ Paper: "Multi-view Line Optimization" with free poses; the cost is the quadratic
 (`pose_correction`) in place of one free pose a frame: what moves faster than its control points is
 taken for noise of the observations. Damped Gauss-Newton; the lines, which share no observation, are
 eliminated first (Schur complement), and what is left is a dense system of the control points.
+How far the given poses may be off is learned on the way (`Drift.estimated`).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from roel_service.geometry.se3 import rotation_vector_jacobian
 from roel_service.mapping import joint_kernels, refine_kernels
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected
-from roel_service.mapping.pose_correction import PoseCorrection, drift_information
+from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import (
     DAMPING_AFTER_FAILURE,
     DAMPING_AFTER_SUCCESS,
@@ -41,6 +42,8 @@ from roel_service.scene.lines import InfiniteLines
 
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 6
+# An estimated drift is at least this share of the configured one.
+LEAST_DRIFT_SHARE = 0.01
 # A step that lowers the cost by less than this share ends the iteration.
 CONVERGED_SHARE = 1e-4
 # Doubles of the blocks that are in memory at a time while lines are eliminated: 64 MiB.
@@ -54,13 +57,16 @@ class JointlyRefined:
     Attributes:
         lines: L lines, world.
         correction: of the trajectory that the frames' poses came from.
+        drift: of that trajectory, as the correction tells it.
         information: (6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2.
-        costs: after each step, the first one before any; in units of the observations' noise.
+        costs: of the observations after each step, the first one before any; in units of their
+            noise.
         converged: the last step changed next to nothing.
     """
 
     lines: InfiniteLines
     correction: PoseCorrection
+    drift: Drift
     information: FloatArray
     costs: list[float]
     converged: bool
@@ -70,6 +76,7 @@ class JointlyRefined:
 class _State:
     lines: OrthonormalLines
     correction: PoseCorrection
+    drift: Drift
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,12 +85,14 @@ class _System:
 
     Attributes:
         cost: of everything.
+        observation_cost: of the observations alone.
         line_gradient, line_hessian: (L, 4) and (L, 4, 4).
         control_gradient, control_hessian: (6 K,) and (6 K, 6 K).
         rows: (S, 4, 6) by line and pose.
     """
 
     cost: float
+    observation_cost: float
     line_gradient: FloatArray
     line_hessian: FloatArray
     control_gradient: FloatArray
@@ -91,9 +100,24 @@ class _System:
     rows: FloatArray
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Reduced:
+    """The normal equations of the control points, the lines being eliminated.
+
+    Attributes:
+        hessian, gradient: (6 K, 6 K) and (6 K,), damped.
+        line_inverse: (L, 4, 4) what then solves for the lines.
+    """
+
+    hessian: FloatArray
+    gradient: FloatArray
+    line_inverse: FloatArray
+
+
 def refine_jointly(
     refined: Refined,
     correction: PoseCorrection,
+    drift: Drift,
     detected: Detected,
     config: RefineConfig,
     directions: DirectionPrior | None,
@@ -105,22 +129,24 @@ def refine_jointly(
     Args:
         refined: L first estimates with their tracks.
         correction: the first estimate, of what the poses of the frames lack.
+        drift: the first estimate of how large that is.
         detected: the frames with the poses that the correction applies to, and what was seen.
         config: loss, gates, noise of an observation, drift of the poses and number of steps.
         directions: that lines are held to.
         free_lines: whether the lines move too.
     """
     problem = _Problem(refined, correction, detected, config, directions, free_lines=free_lines)
-    state = problem.first_state(refined.lines, correction)
+    state = problem.first_state(refined.lines, correction, drift)
     damping = FIRST_DAMPING
     costs: list[float] = []
     converged = False
     for iteration in range(config.pose_iteration_count):
         weight = problem.weight(state, loose=iteration < LOOSE_ITERATION_COUNT)
         system = problem.system(state, weight)
-        costs.append(system.cost)
+        costs.append(system.observation_cost)
         for _ in range(MAX_TRIAL_COUNT):
-            trial = problem.step(state, system, damping)
+            reduced = problem.reduced(system, damping)
+            trial = problem.step(state, system, reduced)
             cost = problem.cost(trial, weight)
             if cost <= system.cost:
                 break
@@ -128,7 +154,7 @@ def refine_jointly(
         else:
             converged = True
             break
-        state = trial
+        state = problem.with_drift(trial, reduced)
         damping *= DAMPING_AFTER_SUCCESS
         converged = system.cost - cost <= CONVERGED_SHARE * system.cost
         if converged and iteration >= LOOSE_ITERATION_COUNT:
@@ -137,8 +163,9 @@ def refine_jointly(
     return JointlyRefined(
         lines=problem.world_lines(state),
         correction=state.correction,
-        information=problem.reduced(system, 0.0)[0],
-        costs=[*costs, system.cost],
+        drift=state.drift,
+        information=problem.reduced(system, 0.0).hessian,
+        costs=[*costs, system.observation_cost],
         converged=converged,
     )
 
@@ -176,12 +203,11 @@ class _Problem:
         self.length_weight = np.minimum(length_px, most_px) / most_px
         self.first_control, self.basis = correction.basis(frames.t_us)
         self.shares = correction.shares(frames.t_us)
-        self.drift = drift_information(correction, config)
 
-    def first_state(self, lines: InfiniteLines, correction: PoseCorrection) -> _State:
+    def first_state(self, lines: InfiniteLines, correction: PoseCorrection, drift: Drift) -> _State:
         moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
         U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
-        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction)
+        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction, drift=drift)
 
     def world_lines(self, state: _State) -> InfiniteLines:
         direction, moment = state.lines.plucker
@@ -234,8 +260,7 @@ class _Problem:
 
     def _prior_cost(self, state: _State) -> float:
         """Of directions and drift."""
-        control = state.correction.control.ravel()
-        cost = float(control @ self.drift @ control)
+        cost = float(np.sum(state.correction.control * state.drift.pull(state.correction)))
         if self.directions is not None:
             held = direction_system(state.lines, self.directions)
             cost += self.precision * float(held.cost.sum())
@@ -274,11 +299,12 @@ class _Problem:
         hessian = (control_by_frame.T @ blocks @ control_by_frame).toarray()
         return _System(
             cost=float(cost.sum()) + self._prior_cost(state),
+            observation_cost=float(cost.sum()),
             line_gradient=by_line,
             line_hessian=by_lines,
             control_gradient=control_by_frame.T @ by_pose.ravel()
-            + self.drift @ state.correction.control.ravel(),
-            control_hessian=hessian + self.drift,
+            + state.drift.pull(state.correction).ravel(),
+            control_hessian=hessian + state.drift.information(state.correction),
             rows=rows,
         )
 
@@ -289,8 +315,8 @@ class _Problem:
         derivative[:, :3, :3] = rotation_vector_jacobian(tangent[:, :3])
         return derivative
 
-    def reduced(self, system: _System, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The system of the control points alone, and what solves for a line: (L, 4, 4) inverses."""
+    def reduced(self, system: _System, damping: float) -> _Reduced:
+        """The system of the control points alone."""
         diagonal = np.einsum("lii->li", system.line_hessian)
         damped = system.line_hessian + np.einsum(
             "li,ij->lij", damping * diagonal + RIDGE, np.eye(4)
@@ -305,7 +331,7 @@ class _Problem:
             weighted = np.einsum("lij,lj->li", inverse[lines], system.line_gradient[lines])
             gradient -= np.einsum("lik,li->k", blocks, weighted)
         hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
-        return hessian, gradient, inverse
+        return _Reduced(hessian=hessian, gradient=gradient, line_inverse=inverse)
 
     def _blocks(self, system: _System) -> Iterator[tuple[slice, FloatArray]]:
         """Lines in turn with their (l, 4, 6 K) blocks by the control points."""
@@ -329,21 +355,28 @@ class _Problem:
                 ),
             )
 
-    def step(self, state: _State, system: _System, damping: float) -> _State:
-        """One damped step of everything."""
-        hessian, gradient, inverse = self.reduced(system, damping)
-        control = -linalg.solve(hessian, gradient, assume_a="pos").reshape(-1, 6)
+    def step(self, state: _State, system: _System, reduced: _Reduced) -> _State:
+        """One step of everything."""
+        solved = linalg.solve(reduced.hessian, reduced.gradient, assume_a="pos")
+        control = -solved.reshape(-1, 6)
         correction = state.correction.stepped(control)
         if not self.free_lines:
-            return _State(lines=state.lines, correction=correction)
+            return replace(state, correction=correction)
         by_pose = (self.shares @ control)[self.frame_of[self.observation]]
         pulls = np.einsum("sij,sj->si", system.rows, by_pose)
         pull = np.stack([self._total(column) for column in pulls.T], axis=1)
-        delta = -np.einsum("lij,lj->li", inverse, system.line_gradient + pull)
+        delta = -np.einsum("lij,lj->li", reduced.line_inverse, system.line_gradient + pull)
         turn = np.linalg.norm(delta[:, :3], axis=1)
         delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
         U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, delta)
-        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction)
+        return replace(state, lines=OrthonormalLines(U=U, phi=phi), correction=correction)
+
+    def with_drift(self, state: _State, reduced: _Reduced) -> _State:
+        """With the drift that the correction tells of, as well as the last step's system knows."""
+        covariance = np.asarray(np.linalg.inv(reduced.hessian), dtype=np.float64)
+        drift = state.drift.estimated(state.correction, covariance)
+        configured = Drift.configured(self.config)
+        return replace(state, drift=drift.at_least(LEAST_DRIFT_SHARE, configured))
 
     def _total(self, rows: FloatArray) -> FloatArray:
         """(L,) sums of (S,) rows over each line."""

@@ -8,7 +8,7 @@ is, and how large.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -23,6 +23,8 @@ from roel_service.scene.trajectory import Trajectory
 ORDER = 4
 # Control points that are solved for at once: their normal equations take 288 MiB.
 MAX_CONTROL_COUNT = 1024
+# Observations determine at least this share of the control points, when a drift is estimated.
+MIN_KNOWN_SHARE = 1e-3
 # (N, 4) shares of the control points at the time s in [0, 1] of their interval: powers of s.
 BASIS = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6.0
 
@@ -99,15 +101,75 @@ class PoseCorrection:
         return Trajectory(t_us=trajectory.t_us, T_world_camera=poses)
 
 
-def drift_information(correction: PoseCorrection, config: RefineConfig) -> FloatArray:
-    """(6 K, 6 K) inverse covariance of the control points, before anything is observed.
+@dataclass(frozen=True, kw_only=True)
+class Drift:
+    """How far an odometry wanders off: an Ornstein-Uhlenbeck process of six coordinates.
 
-    Of an Ornstein-Uhlenbeck process with the configured deviation and time: its inverse covariance
-    at equal steps is tridiagonal.
+    Attributes:
+        sigma_rad, sigma_m: standard deviations of rotation and position.
+        forgets_s: the time after which it has forgotten them.
     """
-    keep = np.exp(-correction.interval_us * 1e-6 / config.pose_drift_s)
-    count = len(correction)
-    chain = (1.0 + keep**2) * np.eye(count) - keep * (np.eye(count, k=1) + np.eye(count, k=-1))
-    chain[0, 0] = chain[-1, -1] = 1.0
-    deviation = [np.deg2rad(config.pose_drift_deg)] * 3 + [config.pose_drift_m] * 3
-    return np.kron(chain / (1.0 - keep**2), np.diag(1.0 / np.square(deviation)))
+
+    sigma_rad: float
+    sigma_m: float
+    forgets_s: float
+
+    @staticmethod
+    def configured(config: RefineConfig) -> Drift:
+        """What is expected of an odometry that nothing is known about."""
+        return Drift(
+            sigma_rad=float(np.deg2rad(config.pose_drift_deg)),
+            sigma_m=config.pose_drift_m,
+            forgets_s=config.pose_drift_s,
+        )
+
+    def information(self, correction: PoseCorrection) -> FloatArray:
+        """(6 K, 6 K) inverse covariance of the control points, before anything is observed."""
+        precisions = 1.0 / np.square([self.sigma_rad] * 3 + [self.sigma_m] * 3)
+        information = np.kron(self._chain(correction), np.diag(precisions))
+        return np.asarray(information, dtype=np.float64)
+
+    def pull(self, correction: PoseCorrection) -> FloatArray:
+        """(K, 6) the information times the control points."""
+        precisions = 1.0 / np.square([self.sigma_rad] * 3 + [self.sigma_m] * 3)
+        return np.asarray(self._chain(correction) @ correction.control * precisions)
+
+    def estimated(self, correction: PoseCorrection, covariance: FloatArray) -> Drift:
+        """The deviations under which a correction is as large as it was to be expected.
+
+        One step towards the largest evidence (MacKay 1992): the squared correction, over as many
+        unknowns as the observations determine. Poses that fit their observations as they are have
+        no drift then, and stay.
+
+        Args:
+            correction: as refined with this drift.
+            covariance: (6 K, 6 K) of its control points, given the observations.
+        """
+        count = len(correction)
+        chain = self._chain(correction)
+        blocks = covariance.reshape(count, 6, count, 6)
+        sigmas = []
+        for sigma, axes in ((self.sigma_rad, slice(0, 3)), (self.sigma_m, slice(3, 6))):
+            control = correction.control[:, axes]
+            size = np.einsum("ki,kl,li->", control, chain, control)
+            open_count = np.einsum("kl,kili->", chain, blocks[:, axes, :, axes]) / sigma**2
+            known_count = max(MIN_KNOWN_SHARE * control.size, control.size - open_count)
+            sigmas.append(float(np.sqrt(size / known_count)))
+        return replace(self, sigma_rad=sigmas[0], sigma_m=sigmas[1])
+
+    def at_least(self, share: float, other: Drift) -> Drift:
+        """With deviations of no less than a share of another drift's."""
+        return replace(
+            self,
+            sigma_rad=max(self.sigma_rad, share * other.sigma_rad),
+            sigma_m=max(self.sigma_m, share * other.sigma_m),
+        )
+
+    def _chain(self, correction: PoseCorrection) -> FloatArray:
+        """(K, K) inverse covariance of a coordinate with deviation 1: tridiagonal."""
+        keep = np.exp(-correction.interval_us * 1e-6 / self.forgets_s)
+        count = len(correction)
+        chain = (1.0 + keep**2) * np.eye(count)
+        chain -= keep * (np.eye(count, k=1) + np.eye(count, k=-1))
+        chain[0, 0] = chain[-1, -1] = 1.0
+        return np.asarray(chain / (1.0 - keep**2))

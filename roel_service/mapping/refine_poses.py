@@ -24,7 +24,7 @@ from roel_service.mapping.front_end import Detected, lines_of_all_frames
 from roel_service.mapping.joint import JointlyRefined, refine_jointly
 from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
-from roel_service.mapping.pose_correction import PoseCorrection
+from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.smooth_poses import smoothed
@@ -146,6 +146,7 @@ def _with_own_lines(
 ) -> tuple[Refined, list[JointlyRefined]]:
     """Rounds of matching with the poses as they are, and of refining lines and poses together."""
     refined = _first_lines(detected, config, run)
+    drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
     for gate_px in config.refine.pose_gates_px:
         gated = _with_gate(config, gate_px)
@@ -158,8 +159,8 @@ def _with_own_lines(
         _check_count(refined)
         with run.stage("refine"):
             directions = direction_prior(refined, gated.refine)
-            joint = refine_jointly(refined, correction, detected, gated.refine, directions)
-            correction = joint.correction
+            joint = refine_jointly(refined, correction, drift, detected, gated.refine, directions)
+            correction, drift = joint.correction, joint.drift
             frames, evidence = _seen_with(detected, correction)
             refined = run.without_diverged(
                 refine_lines(
@@ -182,6 +183,7 @@ def _in_map(
     direction, moment = plucker.plucker_from_endpoints(line_map.segments)
     lines = InfiniteLines(direction=direction, moment=moment)
     gates_px = config.refine.pose_gates_px
+    drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
     for gate_px in (*(wider * gates_px[0] for wider in MAP_GATES), *gates_px):
         gated = _with_gate(config, gate_px)
@@ -194,9 +196,9 @@ def _in_map(
         _check_count(refined)
         with run.stage("refine"):
             joint = refine_jointly(
-                refined, correction, detected, gated.refine, None, free_lines=False
+                refined, correction, drift, detected, gated.refine, None, free_lines=False
             )
-            correction = joint.correction
+            correction, drift = joint.correction, joint.drift
         found.append(joint)
     return refined, found
 

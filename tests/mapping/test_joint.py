@@ -10,7 +10,7 @@ from roel_service.geometry.alignment import align_points
 from roel_service.geometry.se3 import SE3
 from roel_service.mapping.front_end import Detected
 from roel_service.mapping.joint import _Problem, _State, refine_jointly
-from roel_service.mapping.pose_correction import PoseCorrection
+from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import OrthonormalLines, refine_lines
 
 from .synthetic import line_errors, observed, perturbed, trajectory, world
@@ -25,6 +25,8 @@ CONFIG = RefineConfig(
     pose_drift_m=0.05,
     max_residual_px=20.0,
 )
+
+DRIFT = Drift.configured(CONFIG)
 
 
 def error(seed=0, size_rad=0.004, size_m=0.006):
@@ -83,24 +85,24 @@ class TestRecovery:
         detected = seen(exact, error(seed))
         start = lines_of(exact, detected, perturbed(exact.lines, 0.01, 0.01))
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
-        found = refine_jointly(start, none, detected, CONFIG, None)
+        found = refine_jointly(start, none, DRIFT, detected, CONFIG, None)
         truth = exact.frames.T_world_camera
         before_m, before_rad = aligned_errors(detected.frames.T_world_camera, truth)
         after_m, after_rad = aligned_errors(corrected(found, detected), truth)
         # What is left is the pull of the prior along what the lines hardly tell.
         assert after_m.mean() < 0.1 * before_m.mean()
         assert after_rad.mean() < 0.1 * before_rad.mean()
-        assert (np.diff(found.costs) <= 0.0).all()
+        assert found.costs[-1] < 0.01 * found.costs[0]
 
     def test_poses_are_found_among_lines_that_stay(self):
         exact = world()
         detected = seen(exact, error())
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
         start = lines_of(exact, detected)
-        found = refine_jointly(start, none, detected, CONFIG, None, free_lines=False)
+        found = refine_jointly(start, none, DRIFT, detected, CONFIG, None, free_lines=False)
         truth = exact.frames.T_world_camera
         # The correction is one of tangents, which do not quite add up: 1e-2 rad squared.
-        assert translation_errors_m(corrected(found, detected), truth).max() < 2e-4
+        assert translation_errors_m(corrected(found, detected), truth).max() < 5e-4
         assert rotation_errors_rad(corrected(found, detected), truth).max() < 1e-4
         np.testing.assert_allclose(found.lines.moment, exact.lines.moment, atol=1e-12)
 
@@ -108,16 +110,31 @@ class TestRecovery:
         exact = world()
         detected = seen(exact)
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
-        found = refine_jointly(lines_of(exact, detected), none, detected, CONFIG, None)
+        found = refine_jointly(lines_of(exact, detected), none, DRIFT, detected, CONFIG, None)
         assert np.abs(found.correction.control).max() < 1e-6
         assert line_errors(found.lines, exact.segments).max() < 3e-6
+
+    def test_the_drift_of_the_poses_is_learned(self):
+        exact = world()
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        sigmas = {}
+        for size in (0.0, 1.0):
+            detected = seen(exact, error(size_rad=0.004 * size, size_m=0.006 * size))
+            start = lines_of(exact, detected)
+            found = refine_jointly(start, none, DRIFT, detected, CONFIG, None, free_lines=False)
+            sigmas[size] = found.drift
+        # Control points that know nothing of each other wander faster than the drift expects.
+        assert 0.004 < sigmas[1.0].sigma_rad < 0.02
+        assert 0.006 < sigmas[1.0].sigma_m < 0.03
+        assert sigmas[0.0].sigma_rad < 0.02 * DRIFT.sigma_rad
+        assert sigmas[0.0].sigma_m < 0.02 * DRIFT.sigma_m
 
     def test_no_steps_leave_everything(self):
         exact = world()
         detected = seen(exact, error())
         still = dataclasses.replace(CONFIG, pose_iteration_count=0)
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
-        found = refine_jointly(lines_of(exact, detected), none, detected, still, None)
+        found = refine_jointly(lines_of(exact, detected), none, DRIFT, detected, still, None)
         assert not found.correction.control.any()
         assert not found.converged
 
@@ -138,7 +155,8 @@ class TestGradient:
         problem = _Problem(start, wrong, detected, config, None, free_lines=True)
         moment = plucker.shift_origin(start.lines.direction, start.lines.moment, problem.origin)
         U, phi = plucker.orthonormal_from_plucker(start.lines.direction, moment)
-        state = _State(lines=OrthonormalLines(U=U, phi=phi), correction=wrong)
+        drift = Drift.configured(config)
+        state = _State(lines=OrthonormalLines(U=U, phi=phi), correction=wrong, drift=drift)
         weight = rng.uniform(0.1, 1.0, len(problem.line))
         system = problem.system(state, weight)
         assert problem.cost(state, weight) == pytest.approx(system.cost, rel=1e-12)
@@ -146,7 +164,7 @@ class TestGradient:
         def cost(line_step, control_step):
             moved = plucker.retract_orthonormal(U, phi, line_step)
             lines = OrthonormalLines(U=moved[0], phi=moved[1])
-            stepped = _State(lines=lines, correction=wrong.stepped(control_step))
+            stepped = _State(lines=lines, correction=wrong.stepped(control_step), drift=drift)
             return problem.cost(stepped, weight)
 
         no_line, no_control = np.zeros((len(phi), 4)), np.zeros((len(wrong), 6))
@@ -171,7 +189,7 @@ class TestGradient:
         start = lines_of(noisy, detected)
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
         problem = _Problem(start, none, detected, CONFIG, None, free_lines=True)
-        state = problem.first_state(start.lines, none)
+        state = problem.first_state(start.lines, none, DRIFT)
         system = problem.system(state, problem.weight(state, loose=True))
         line_count, size = len(start), 6 * len(none)
         whole = np.zeros((4 * line_count + size, 4 * line_count + size))
@@ -184,7 +202,7 @@ class TestGradient:
         whole[4 * line_count :, 4 * line_count :] = system.control_hessian
         gradient = np.concatenate([system.line_gradient.ravel(), system.control_gradient])
         step = -np.linalg.solve(whole, gradient)[4 * line_count :]
-        moved = problem.step(state, system, 0.0)
+        moved = problem.step(state, system, problem.reduced(system, 0.0))
         np.testing.assert_allclose(
             moved.correction.control.ravel(), step, atol=1e-5 * np.abs(step).max()
         )

@@ -3,7 +3,7 @@ import pytest
 
 from roel_service.config.stages import RefineConfig
 from roel_service.errors import LimitError
-from roel_service.mapping.pose_correction import PoseCorrection, drift_information
+from roel_service.mapping.pose_correction import Drift, PoseCorrection
 
 from .synthetic import DURATION_US, trajectory
 
@@ -55,7 +55,7 @@ def test_the_correction_has_no_jumps():
 def test_drift_is_that_of_an_odometry_that_forgets():
     config = RefineConfig(pose_drift_deg=0.5, pose_drift_m=0.02, pose_drift_s=0.7)
     found = correction()
-    covariance = np.linalg.inv(drift_information(found, config))
+    covariance = np.linalg.inv(Drift.configured(config).information(found))
     count = len(found)
     apart_s = np.abs(np.subtract.outer(np.arange(count), np.arange(count))) * found.interval_us
     expected = np.exp(-apart_s * 1e-6 / 0.7)
@@ -63,6 +63,31 @@ def test_drift_is_that_of_an_odometry_that_forgets():
     np.testing.assert_allclose(by_time[:, 0, :, 0], np.deg2rad(0.5) ** 2 * expected, atol=1e-12)
     np.testing.assert_allclose(by_time[:, 5, :, 5], 0.02**2 * expected, atol=1e-12)
     assert not by_time[:, 0, :, 1].any()
+
+
+def test_a_drift_pulls_by_its_information():
+    drift = Drift(sigma_rad=0.01, sigma_m=0.02, forgets_s=0.7)
+    found = correction(np.random.default_rng(0).normal(size=(len(correction()), 6)))
+    pull = drift.information(found) @ found.control.ravel()
+    np.testing.assert_allclose(drift.pull(found).ravel(), pull, rtol=1e-9)
+
+
+def test_the_size_of_a_drift_is_found_from_a_correction():
+    true = Drift(sigma_rad=0.01, sigma_m=0.2, forgets_s=0.3)
+    count = len(correction())
+    rng = np.random.default_rng(0)
+    spread = np.linalg.cholesky(np.linalg.inv(true.information(correction())))
+    drawn = correction((spread @ rng.normal(size=6 * count)).reshape(count, 6))
+    known = np.zeros((6 * count, 6 * count))
+    expected = Drift(sigma_rad=1.0, sigma_m=1.0, forgets_s=0.3)
+    found = expected.estimated(drawn, known)
+    assert found.sigma_rad == pytest.approx(true.sigma_rad, rel=0.25)
+    assert found.sigma_m == pytest.approx(true.sigma_m, rel=0.25)
+    # What is not observed at all tells nothing: the few unknowns that are left are not divided by.
+    unknown = np.linalg.inv(expected.information(correction()))
+    assert np.isfinite(expected.estimated(drawn, unknown).sigma_m)
+    assert expected.at_least(2.0, true).sigma_m == 1.0
+    assert true.at_least(0.5, expected).sigma_m == 0.5
 
 
 def test_too_long_a_recording_is_refused():
