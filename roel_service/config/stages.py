@@ -454,6 +454,39 @@ class LocalizeConfig(Stage, table="localize"):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TrackConfig(Stage, table="track"):
+    """Poses of a moving camera in a map that is there already.
+
+    Attributes:
+        interval_us: a pose is told so often, from the events of that time.
+        max_event_count: events of an interval that are used; of more, every n-th.
+        reach_m, reach_deg: how far off the first pose may be, and the last one after a loss.
+        acceleration_m_s2, turn_acceleration_deg_s2: how the camera's motion changes, standard
+            deviations.
+        event_noise_px: of one event across its line.
+        line_noise_px, line_noise_m: of a line as a whole, in the picture and in the map; what it
+            has of both does not go away with more events.
+        min_seen_share: share of the moving lines in view on which events must be.
+        min_sharpness: density of events on the lines against that beside them.
+        max_sigma_m, max_sigma_deg: a pose that is known no better than this is uncertain.
+    """
+
+    interval_us: int = parameter(25_000, Rule("2000 to 100000", lambda v: 2000 <= v <= 100_000))
+    max_event_count: int = parameter(8_000, Rule("100 to 10^6", lambda v: 100 <= v <= 1_000_000))
+    reach_m: float = parameter(0.2, POSITIVE)
+    reach_deg: float = parameter(10.0, at_most(45))
+    acceleration_m_s2: float = parameter(3.0, POSITIVE)
+    turn_acceleration_deg_s2: float = parameter(200.0, POSITIVE)
+    event_noise_px: float = parameter(0.7, POSITIVE)
+    line_noise_px: float = parameter(0.3, POSITIVE)
+    line_noise_m: float = parameter(0.004, POSITIVE)
+    min_seen_share: float = parameter(0.6, SHARE)
+    min_sharpness: float = parameter(6.0, POSITIVE)
+    max_sigma_m: float = parameter(0.03, POSITIVE)
+    max_sigma_deg: float = parameter(1.0, POSITIVE)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RuntimeConfig(Stage, table="runtime"):
     """How the work is done; nothing but speed depends on it, except for the seed.
 
@@ -515,3 +548,4 @@ class Config:
     runtime: RuntimeConfig = RuntimeConfig()
     curves: CurvesConfig = CurvesConfig()
     localize: LocalizeConfig = LocalizeConfig()
+    track: TrackConfig = TrackConfig()

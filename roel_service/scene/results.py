@@ -174,6 +174,43 @@ class PoseResult:
     report: PoseReport
 
 
+class PoseStatus(Enum):
+    """Whether a tracked pose may be relied on."""
+
+    TRACKING = "TRACKING"
+    UNCERTAIN = "UNCERTAIN"
+    LOST = "LOST"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrackedPose:
+    """Where the camera was at one time.
+
+    Attributes:
+        t_us: time of the pose.
+        status: `UNCERTAIN` is a pose that few lines hold, that was found just now, or that does
+            not go with the motion before it.
+        T_world_camera: pose; None exactly when LOST.
+        covariance: (6, 6) of (r, d), rad and m, world; None exactly when LOST.
+        seen_share: share of the moving lines in view, by length, on which events lie.
+        sharpness: density of events on those lines against that beside them; 1 by chance.
+        event_count: events of the interval.
+    """
+
+    t_us: int
+    status: PoseStatus
+    T_world_camera: SE3 | None
+    covariance: FloatArray | None
+    seen_share: float
+    sharpness: float
+    event_count: int
+
+    def __post_init__(self) -> None:
+        if self.covariance is not None:
+            covariance = frozen_array(self.covariance, np.float64, (6, 6), "covariance")
+            object.__setattr__(self, "covariance", covariance)
+
+
 class LocalizationStatus(Enum):
     """Whether the pose of a picture may be relied on."""
 

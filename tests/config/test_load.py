@@ -37,6 +37,8 @@ RANGES = {
     "localize.max_width_px": (512, 8192),
     "localize.crop_px": (64, 1024),
     "localize.max_hypothesis_count": (1, 5),
+    "track.interval_us": (2_000, 100_000),
+    "track.max_event_count": (100, 1_000_000),
 }
 
 

@@ -162,7 +162,7 @@ class TestConfig:
         package = Path(roel_service.__file__).parent
         sources = [
             path.read_text(encoding="utf-8")
-            for folder in ("mapping", "register", "pano_loc", "jobs", "service")
+            for folder in ("mapping", "register", "pano_loc", "tracking", "jobs", "service")
             for path in (package / folder).rglob("*.py")
         ]
         assert any(re.search(rf"\.{name}\b", source) for source in sources)

@@ -1,0 +1,231 @@
+"""Where the camera is, from a rough guess: lines of one moment laid onto the lines of the map.
+
+Poses all over the reach of the guess are scored by fields of nearness to the lines that are seen,
+one field for each direction; the best ones breed closer ones while the fields get narrower. What is
+left is fitted to the space-time planes of the lines, which tell the velocity too.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray
+from roel_service.config.stages import DetectConfig, FramesConfig, PlaneFitConfig, TrackConfig
+from roel_service.geometry import segments
+from roel_service.geometry.se3 import SE3
+from roel_service.mapping.detect import EDLines, detect_lines
+from roel_service.mapping.frames import event_frame
+from roel_service.mapping.plane_fit import FittedLines, fit_space_time_planes
+from roel_service.mapping.representations import event_images
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventStream
+from roel_service.scene.trajectory import Trajectory
+from roel_service.tracking import search_kernels
+from roel_service.tracking.fit import MIN_DEPTH_SHARE, View, Window, WindowFit, fit_window
+from roel_service.tracking.motion import MotionState
+from roel_service.tracking.pieces import MapPieces, equal_parts
+
+# Lines of one moment: one window without poses, so of few events.
+FRAMES = FramesConfig(compensate_rotation=False)
+DETECT = DetectConfig(window_events_per_pixel=(0.1,))
+# Directions that are told apart, of half a turn.
+DIRECTION_COUNT = 12
+# Pixels of a cell of the fields, and how near is near in each round, both shares of the focal
+# length.
+CELL_SHARE = 0.008
+NEARNESS_SHARES = (0.04, 0.02, 0.01, 0.006)
+# The first round's poses are so far apart, as shares of the reach.
+TURN_STEP, SHIFT_STEP = 0.3, 0.5
+# Poses that are kept after a round, and children of each.
+KEPT_COUNT, CHILD_COUNT = 40, 24
+# Poses that are fitted in the end, at least this far apart as shares of the reach.
+FITTED_COUNT, APART = 6, 0.15
+# Points of a seen line are so far apart, in its direction and in time.
+POINT_PX, MOMENTS_S = 2.0, (-0.005, 0.0, 0.005)
+# So many cells from any line, nothing is near.
+FAR = 1e4
+# Scales of the fits, px: to the lines that are seen, then to events.
+LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
+# What is not known of a pose after the search, as shares of the reach; and of the velocity.
+POSE_SIGMA_SHARE = 0.5
+SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 120.0, 1.5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Eyes:
+    """What turns events into lines, and where lines are looked for.
+
+    Attributes:
+        camera: calibration.
+        ideal_px: (H, W, 2) undistortion table.
+        view: calibration of the ideal picture.
+        pieces: of the map.
+    """
+
+    camera: Camera
+    ideal_px: Array
+    view: View
+    pieces: MapPieces
+
+
+def locate(
+    guess: SE3,
+    events: EventStream,
+    window: Window,
+    eyes: Eyes,
+    config: TrackConfig,
+    rng: np.random.Generator,
+) -> WindowFit | None:
+    """The state in the middle of a window, within the configured reach of a guess.
+
+    Args:
+        guess: rough `T_world_camera`.
+        events: around the middle of the window.
+        window: the events of one interval.
+        rng: draws the poses that are tried.
+
+    Returns:
+        The best fit there is, however poor; None where no line is seen.
+    """
+    lines = _seen_lines(events, window.t_us, eyes)
+    if len(lines.polarity) == 0:
+        return None
+    poses = _search(guess, lines, eyes, config, rng)
+    sampled = _sampled(lines, window.t_us)
+    fits = [
+        fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
+        for state in (_unmoved(pose, window.t_us, config) for pose in poses)
+    ]
+    best = sorted(fits, key=_explained, reverse=True)[:2]
+    on_events = [
+        fit_window(fit.state, window, eyes.pieces, eyes.view, config, EVENT_SCALES_PX)
+        for fit in best
+    ]
+    return max(on_events, key=_explained)
+
+
+def _explained(fit: WindowFit) -> float:
+    return fit.evidence.seen_px * fit.evidence.seen_share
+
+
+def _unmoved(pose: SE3, t_us: int, config: TrackConfig) -> MotionState:
+    """A pose of which little is known, and nothing of its motion."""
+    deviation = [
+        *[POSE_SIGMA_SHARE * np.deg2rad(config.reach_deg)] * 3,
+        *[POSE_SIGMA_SHARE * config.reach_m] * 3,
+        *[np.deg2rad(SPEED_SIGMA_DEG_S)] * 3,
+        *[SPEED_SIGMA_M_S] * 3,
+    ]
+    return MotionState(
+        t_us=t_us,
+        T_world_camera=pose,
+        velocity=np.zeros(6),
+        covariance=np.diag(np.square(deviation)),
+    )
+
+
+def _seen_lines(events: EventStream, t_us: int, eyes: Eyes) -> FittedLines:
+    """Lines at one time with their speeds, without any poses."""
+    # The frame asks for poses, but with compensation off it does not look at them.
+    still = Trajectory(
+        t_us=np.array([t_us, t_us + 1]),
+        T_world_camera=SE3(rotation=np.stack([np.eye(3)] * 2), translation=np.zeros((2, 3))),
+    )
+    frame = event_frame(events, t_us, eyes.ideal_px, still, eyes.camera, FRAMES, DETECT)
+    seeds = detect_lines(event_images(frame, DETECT), EDLines(DETECT), DETECT)
+    return fit_space_time_planes(seeds, frame, PlaneFitConfig(), np.random.default_rng(0))
+
+
+def _sampled(lines: FittedLines, t_us: int) -> Window:
+    """Points of the space-time planes of lines, as a window of events would have them."""
+    along = segments.span(lines.segments_px)
+    length_px = segments.length(lines.segments_px)
+    line, begin, end = equal_parts(np.maximum(2, np.ceil(length_px / POINT_PX)))
+    middle = 0.5 * (begin + end)[:, None]
+    xy_px = lines.segments_px[line, 0] + middle * along[line]
+    normal = segments.left_normal(lines.segments_px)
+    speed_px_per_s = 1e3 * lines.normal_speed_px_per_ms[:, None] * normal
+    moments_s = np.array(MOMENTS_S)
+    moved = xy_px + moments_s[:, None, None] * speed_px_per_s[line]
+    return Window(
+        t_us=t_us,
+        xy_px=moved.reshape(-1, 2),
+        slot=np.repeat(np.arange(len(moments_s)), len(line)),
+        slot_s=moments_s,
+        span_s=MOMENTS_S[-1] - MOMENTS_S[0],
+        is_quiet=False,
+        event_count=len(moved[0]),
+    )
+
+
+def _search(
+    guess: SE3, lines: FittedLines, eyes: Eyes, config: TrackConfig, rng: np.random.Generator
+) -> list[SE3]:
+    """The most likely poses within reach of a guess, some apart from each other."""
+    focal_px = float(np.sqrt(eyes.view.K[0, 0] * eyes.view.K[1, 1]))
+    reach = np.array([np.deg2rad(config.reach_deg)] * 3 + [config.reach_m] * 3)
+    cell_px = CELL_SHARE * focal_px
+    points = eyes.pieces.segments.mean(axis=1)
+    steps = _ball(TURN_STEP), _ball(SHIFT_STEP)
+    tangents = np.array([np.concatenate(pair) for pair in itertools.product(*steps)]) * reach
+    spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
+    for share in NEARNESS_SHARES:
+        fields = _fields(lines.segments_px, share * focal_px, cell_px, eyes.view)
+        poses = guess.retract(tangents)
+        score = search_kernels.scores(
+            poses.rotation,
+            poses.translation,
+            points,
+            eyes.pieces.direction,
+            eyes.view.K,
+            fields,
+            cell_px,
+            MIN_DEPTH_SHARE * eyes.pieces.extent_m,
+        )
+        tangents = tangents[np.argsort(-score, kind="stable")[:KEPT_COUNT]]
+        if share != NEARNESS_SHARES[-1]:
+            spread = 0.5 * spread
+            noise = rng.normal(size=(len(tangents), CHILD_COUNT, 6)) * spread
+            children = (tangents[:, None] + noise).reshape(-1, 6)
+            tangents = np.concatenate([tangents, children])
+    return [guess.retract(tangent) for tangent in _apart(tangents / reach) * reach]
+
+
+def _ball(step: float) -> FloatArray:
+    """(n, 3) points of a cubic grid within the unit ball."""
+    axis = np.arange(-np.floor(1.0 / step), np.floor(1.0 / step) + 1) * step
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    return np.asarray(grid[np.linalg.norm(grid, axis=1) <= 1.0])
+
+
+def _apart(candidates: FloatArray) -> FloatArray:
+    """(n, 6) the first candidates of which none lies beside an earlier one."""
+    kept: list[FloatArray] = []
+    for candidate in candidates:
+        if all(np.abs(candidate - other).max() > APART for other in kept):
+            kept.append(candidate)
+        if len(kept) == FITTED_COUNT:
+            break
+    return np.array(kept)
+
+
+def _fields(segments_px: FloatArray, nearness_px: float, cell_px: float, view: View) -> Array:
+    """(A, h, w) float32: for each direction, how near a segment of about that direction is."""
+    height, width = (int(np.ceil(size / cell_px)) for size in (view.height, view.width))
+    along = segments.span(segments_px)
+    angle = np.arctan2(along[:, 1], along[:, 0]) / np.pi * DIRECTION_COUNT
+    place = np.round(angle).astype(np.int64)
+    ends = np.round((segments_px + 0.5) / cell_px - 0.5).astype(np.int32)
+    fields = np.empty((DIRECTION_COUNT, height, width), np.float32)
+    for direction in range(DIRECTION_COUNT):
+        apart = (place - direction + DIRECTION_COUNT // 2) % DIRECTION_COUNT - DIRECTION_COUNT // 2
+        ink = np.full((height, width), 255, np.uint8)
+        cv2.polylines(ink, list(ends[np.abs(apart) <= 1]), isClosed=False, color=0)
+        # Without a line everything is far away, and OpenCV says how far: a number to overflow.
+        away = np.minimum(cv2.distanceTransform(ink, cv2.DIST_L2, 3), FAR)
+        fields[direction] = np.exp(-0.5 * np.square(away * (cell_px / nearness_px)))
+    return fields

@@ -1,0 +1,60 @@
+"""Loop over poses and points of the map: how much of what is seen lies where a pose puts it."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray
+
+
+@numba.njit(cache=True, nogil=True)
+def scores(
+    R_world_camera: FloatArray,
+    centres: FloatArray,
+    points: FloatArray,
+    direction: FloatArray,
+    K: FloatArray,
+    fields: Array,
+    cell_px: float,
+    min_depth_m: float,
+) -> FloatArray:
+    """(B,) mean nearness of the map's points in view to seen lines of their direction.
+
+    Args:
+        R_world_camera, centres: (B, 3, 3), (B, 3) poses.
+        points, direction: (S, 3) of the map, and the unit directions of their lines.
+        K: (3, 3) px.
+        fields: (A, h, w) float32, for each of A directions of half a turn how near a line is.
+        cell_px: pixels of a cell of the fields.
+        min_depth_m: nearer points do not count.
+    """
+    class_count, height, width = fields.shape
+    result = np.zeros(len(centres))
+    for b in range(len(centres)):
+        R, c = R_world_camera[b], centres[b]
+        total, count = 0.0, 0
+        for s in range(len(points)):
+            dx, dy, dz = points[s, 0] - c[0], points[s, 1] - c[1], points[s, 2] - c[2]
+            z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+            if z < min_depth_m:
+                continue
+            x = (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / z
+            y = (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / z
+            column = (K[0, 0] * x + K[0, 2] + 0.5) / cell_px
+            row = (K[1, 1] * y + K[1, 2] + 0.5) / cell_px
+            if column < 0.0 or row < 0.0 or column >= width or row >= height:
+                continue
+            v = direction[s]
+            vx = R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2]
+            vy = R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2]
+            vz = R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2]
+            angle = math.atan2(vy - y * vz, vx - x * vz)
+            place = math.floor(angle / math.pi * class_count + 0.5) % class_count
+            total += fields[place, int(row), int(column)]
+            count += 1
+        # Poses that see hardly anything are not good ones.
+        result[b] = total / max(count, 0.05 * len(points))
+    return result
