@@ -444,7 +444,7 @@ class LocalizeConfig(Stage, table="localize"):
     crop_px: int = parameter(320, Rule("64 to 1024", lambda value: 64 <= value <= 1024))
     min_arc_deg: float = parameter(2.0, at_most(45))
     max_arc_count: int = parameter(500, at_most(5000))
-    grid_step_m: float = parameter(0.4, POSITIVE)
+    grid_step_m: float = parameter(0.3, POSITIVE)
     max_rotation_count: int = parameter(64, at_most(1000))
     candidate_count: int = parameter(72, at_most(1000))
     max_hypothesis_count: int = parameter(5, Rule("1 to 5", lambda value: 1 <= value <= 5))

@@ -9,9 +9,10 @@ from roel_service.config.stages import LocalizeConfig
 from roel_service.errors import InputError
 from roel_service.pano_loc.arcs import PanoramaArcs, detect_arcs
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
+from roel_service.pano_loc.orientation import rotation_hypotheses
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import refine_poses
-from roel_service.pano_loc.search import coarse_candidates, rotation_hypotheses
+from roel_service.pano_loc.search import coarse_candidates
 from roel_service.pano_loc.verdict import Found, enough_arcs, enough_lines, hypotheses, judge
 from roel_service.scene.results import PanoLocResult
 

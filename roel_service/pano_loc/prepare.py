@@ -1,4 +1,4 @@
-"""What the search looks up of a map: shared directions, places in free space, fields of distances.
+"""What the search looks up of a map: shared directions, places in free space, views from them.
 
 Everything is laid out in the frame of the map's own directions, so that nothing depends on how the
 map lies in the world.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -18,20 +18,25 @@ from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.segments import sample_segments
 from roel_service.geometry.vectors import unit
-from roel_service.pano_loc import fields_kernels
 from roel_service.pano_loc.directions import class_of, principal_frame, shared_directions
+from roel_service.pano_loc.views import (
+    ClassedLines,
+    Views,
+    class_frames,
+    classed_lines,
+    views_from,
+)
 from roel_service.scene.lines import LineMap
 
-# Query directions: a grid on each side of a cube, that turns of the cube leave as it is.
-RAYS_PER_SIDE = 10
-# Fields are made of the longest lines.
-FIELD_LINE_COUNT = 400
 MAX_CHANNEL_COUNT = 6
+# Views at all places: of the longest lines, in so many bearings.
+VIEW_LINE_COUNT, BEARING_COUNT = 400, 180
 # The places lie between these quantiles of the map's length in each direction, and so far inside.
-BOX_QUANTILES = (0.03, 0.97)
-BOX_MARGIN_M = 0.3
+BOX_QUANTILES = (0.02, 0.98)
+BOX_MARGIN_M = 0.2
 SAMPLE_SPACING_M = 0.05
-MAX_PLACE_COUNT = 4000
+# The grid is wider in large maps, and finer in small ones.
+MIN_PLACE_COUNT, MAX_PLACE_COUNT = 400, 4000
 # Shorter lines are more noise than line.
 MIN_LINE_M = 0.05
 
@@ -52,10 +57,10 @@ class PreparedMap:
         channel: (L,) which shared direction a line has; -1 for none.
         shared: (D, 3) unit directions that many lines share, strongest first.
         frame: (3, 3) rotation whose rows are axes along shared directions.
-        rays: (Q, 3) unit query directions, world.
         places: (T, 3) m, places that are tried.
         step_m: spacing of the places.
-        fields: (T, Q, K) uint8 distances to lines of the K strongest classes.
+        lines: those that have a class.
+        views: what these look like from the places.
     """
 
     segments: FloatArray
@@ -63,31 +68,37 @@ class PreparedMap:
     channel: IntArray
     shared: FloatArray
     frame: FloatArray
-    rays: FloatArray
     places: FloatArray
     step_m: float
-    fields: Array
+    lines: ClassedLines
+    views: Views
 
     def __len__(self) -> int:
         return len(self.segments)
 
-    @property
-    def channel_count(self) -> int:
-        return min(len(self.shared), MAX_CHANNEL_COUNT)
-
     def to_arrays(self) -> Arrays:
         """For keeping it; under a name that `preparation_key` gives."""
-        return {name: np.asarray(value) for name, value in vars(self).items()}
+        plain = {name: value for name, value in vars(self).items() if name not in _PARTS}
+        parts = {
+            f"{name}_{key}": value
+            for name in _PARTS
+            for key, value in vars(getattr(self, name)).items()
+        }
+        return {name: np.asarray(value) for name, value in (plain | parts).items()}
 
     @staticmethod
     def from_arrays(arrays: Arrays) -> PreparedMap:
         """The inverse."""
-        values: dict[str, Any] = dict(arrays)
-        return PreparedMap(**values | {"step_m": float(values["step_m"])})
+        values: dict[str, Any] = {
+            name: value.item() if value.ndim == 0 else value for name, value in arrays.items()
+        }
+        for name, kind in _PARTS.items():
+            part = {key.name: values.pop(f"{name}_{key.name}") for key in fields(kind)}
+            values[name] = kind(**part)
+        return PreparedMap(**values)
 
-    def fields_at(self, places: FloatArray) -> Array:
-        """(T, Q, K) fields of other places."""
-        return map_fields(self.segments, self.channel, self.channel_count, places, self.rays)
+
+_PARTS: dict[str, Any] = {"lines": ClassedLines, "views": Views}
 
 
 def preparation_key(map_digest: str, config: LocalizeConfig) -> str:
@@ -107,47 +118,23 @@ def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:
     shared = shared_directions(directions, length_m)
     channel = class_of(directions, shared[:MAX_CHANNEL_COUNT])
     frame = principal_frame(shared)
-    rays = cube_rays(RAYS_PER_SIDE) @ frame
+    lines = classed_lines(segments, channel, class_frames(shared[:MAX_CHANNEL_COUNT], frame))
     places, step_m = free_places(segments, frame, config.grid_step_m)
-    count = min(len(shared), MAX_CHANNEL_COUNT)
     return PreparedMap(
         segments=segments,
         directions=directions,
         channel=channel,
         shared=shared,
         frame=frame,
-        rays=rays,
         places=places,
         step_m=step_m,
-        fields=map_fields(segments, channel, count, places, rays),
+        lines=lines,
+        views=views_from(lines.longest(VIEW_LINE_COUNT), places, BEARING_COUNT),
     )
-
-
-def map_fields(
-    segments: FloatArray,
-    channel: IntArray,
-    channel_count: int,
-    places: FloatArray,
-    rays: FloatArray,
-) -> Array:
-    """(T, Q, K) fields of the longest lines."""
-    chosen = np.flatnonzero(channel >= 0)[:FIELD_LINE_COUNT]
-    return fields_kernels.map_fields(
-        np.ascontiguousarray(segments[chosen]), channel[chosen], channel_count, places, rays
-    )
-
-
-def cube_rays(count: int) -> FloatArray:
-    """(6 count^2, 3) unit rays at equal angles on each side of a cube."""
-    tangent = np.tan(((np.arange(count) + 0.5) / count - 0.5) * np.pi / 2)
-    a, b = (grid.ravel() for grid in np.meshgrid(tangent, tangent))
-    side = np.stack([np.ones_like(a), a, b], axis=-1)
-    sides = [sign * np.roll(side, axis, axis=1) for axis in range(3) for sign in (1.0, -1.0)]
-    return unit(np.concatenate(sides))
 
 
 def free_places(segments: FloatArray, frame: FloatArray, step_m: float) -> tuple[FloatArray, float]:
-    """(T, 3) places inside the map's box, m, and their spacing, which is wider in large maps.
+    """(T, 3) places inside the map's box, m, and their spacing.
 
     Args:
         segments: (L, 2, 3) m.
@@ -160,7 +147,8 @@ def free_places(segments: FloatArray, frame: FloatArray, step_m: float) -> tuple
     low, high = np.quantile(points, BOX_QUANTILES, axis=0)
     middle, reach = (low + high) / 2, np.maximum((high - low) / 2 - BOX_MARGIN_M, 0.0)
     counts = 2.0 * reach / step_m + 1.0
-    step_m *= max(1.0, float((counts.prod() / MAX_PLACE_COUNT) ** (1 / 3)))
+    count = counts.prod()
+    step_m *= float((count / np.clip(count, MIN_PLACE_COUNT, MAX_PLACE_COUNT)) ** (1 / 3))
     # Centred, so that the signs of the axes do not matter.
     axes = [np.arange(-half, half + 0.5) for half in np.floor(2.0 * reach / step_m) / 2]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -18,15 +18,13 @@ from roel_service.pano_loc.search import Candidates
 MAX_SHIFT_M = 0.3
 MAX_TURN_RAD = np.deg2rad(8.0)
 DAMPING = 1e-3
-# Places are compared by so many arcs, at samples so far apart, and so many lines.
-PLACED_ARC_COUNT, PLACED_STEP_RAD, PLACED_LINE_COUNT = 200, np.deg2rad(6.0), 400
-PLACED_GATE_RAD = np.deg2rad(3.0)
 # Least squares: distance of samples, gate between arc and line, kernel width of each iteration.
 FINAL_STEP_RAD = np.deg2rad(2.0)
 FINAL_GATE_RAD = np.deg2rad(5.0)
 FINAL_WIDTHS_RAD = np.deg2rad([0.7, 0.5, 0.5, 0.5])
 # The same for more of the modes, on fewer arcs.
-MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([2.0, 1.5, 1.0, 0.7])
+MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([1.5, 1.0, 0.7])
+MODE_ARC_COUNT, MODE_STEP_RAD = 200, np.deg2rad(6.0)
 # Width of the kernel of a pose's score.
 SCORE_WIDTH_RAD = np.deg2rad(0.7)
 SCORE_GATE_RAD = np.deg2rad(6.0)
@@ -51,30 +49,6 @@ class Samples:
     normals: FloatArray
 
 
-@dataclass(frozen=True, kw_only=True)
-class Round:
-    """One round of the search for better places, orientations as they are.
-
-    Attributes:
-        candidate_count: poses that take part, the best ones.
-        reach: places around each are tried so far away along each axis, in steps of the grid.
-        width_rad: kernel of the score.
-    """
-
-    candidate_count: int
-    reach: float
-    width_rad: float
-
-
-def rounds(candidate_count: int) -> tuple[Round, ...]:
-    """Fewer poses, finer, from round to round."""
-    return (
-        Round(candidate_count=candidate_count, reach=0.5, width_rad=np.deg2rad(2.0)),
-        Round(candidate_count=40, reach=0.25, width_rad=np.deg2rad(1.2)),
-        Round(candidate_count=28, reach=0.125, width_rad=np.deg2rad(0.7)),
-    )
-
-
 def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
     """At least two rays an arc, in the middles of equal parts."""
     counts = np.maximum(np.ceil(arcs.length_rad / step_rad), 2).astype(np.int64)
@@ -94,49 +68,14 @@ def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
 def refine_poses(
     candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, config: LocalizeConfig
 ) -> Candidates:
-    """Modes of the best fit, best first; each scored by the share of the arcs that it explains.
-
-    Places are looked for on ever finer grids before anything is linearised: among hundreds of
-    parallel lines, least squares from a grid's step away ends at the wrong ones.
-    """
-    few = sample_arcs(arcs.take(np.arange(min(len(arcs), PLACED_ARC_COUNT))), PLACED_STEP_RAD)
-    for stage in rounds(config.candidate_count):
-        candidates = distinct(candidates, stage.candidate_count)
-        candidates = _moved(candidates, few, prepared, stage)
+    """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
+    few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
     modes = _refined(distinct(candidates, MODE_COUNT), few, prepared, MODE_WIDTHS_RAD)
     samples = sample_arcs(arcs, FINAL_STEP_RAD)
     best = distinct(modes, config.max_hypothesis_count)
     return distinct(
         _refined(best, samples, prepared, FINAL_WIDTHS_RAD), config.max_hypothesis_count
     )
-
-
-def _moved(
-    candidates: Candidates, samples: Samples, prepared: PreparedMap, stage: Round
-) -> Candidates:
-    """Each candidate at the best place around it."""
-    axis = stage.reach * prepared.step_m * np.array([-1.0, 0.0, 1.0])
-    around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
-    places, scores = [], []
-    for index in range(len(candidates)):
-        pose = candidates.poses[index]
-        tried = pose.translation + around
-        score = refine_kernels.place_scores(
-            samples.rays @ pose.rotation.T,
-            samples.offsets,
-            samples.weight,
-            samples.normals @ pose.rotation.T,
-            prepared.segments[:PLACED_LINE_COUNT],
-            prepared.directions[:PLACED_LINE_COUNT],
-            tried,
-            stage.width_rad,
-            PLACED_GATE_RAD,
-        )
-        best = int(score.argmax())
-        places.append(tried[best])
-        scores.append(score[best])
-    poses = SE3(rotation=candidates.poses.rotation, translation=np.array(places).reshape(-1, 3))
-    return Candidates(poses=poses, score=np.array(scores))
 
 
 def distinct(candidates: Candidates, max_count: int) -> Candidates:
@@ -195,9 +134,8 @@ def match(pose: SE3, samples: Samples, prepared: PreparedMap, max_angle_rad: flo
     """The nearest line of each ray, among those that the arc may be."""
     rays, normals = samples.rays @ pose.rotation.T, samples.normals @ pose.rotation.T
     seen = refine_kernels.viewed_lines(prepared.segments, pose.translation)
-    pairs = refine_kernels.alike(normals, prepared.directions, max_angle_rad)
     line, residual = refine_kernels.match_rays(
-        rays, samples.offsets, normals, pairs, seen, max_angle_rad
+        rays, samples.offsets, normals, prepared.directions, seen, max_angle_rad
     )
     return Matches(rays=rays, seen=seen, line=line, residual=residual)
 

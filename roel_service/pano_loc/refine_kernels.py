@@ -62,90 +62,54 @@ def viewed_lines(
 
 
 @numba.njit(cache=True, nogil=True)
-def alike(
-    normals: FloatArray, directions: FloatArray, max_angle_rad: float
-) -> tuple[IntArray, IntArray]:
-    """Lines that may be each arc by their directions alone, stored ragged: offsets and lines."""
-    offsets = np.zeros(len(normals) + 1, np.int64)
-    lines = np.empty(len(normals) * len(directions), np.int64)
-    sine = np.sin(max_angle_rad)
-    count = 0
-    for a in range(len(normals)):
-        x, y, z = normals[a]
-        for j in range(len(directions)):
-            if abs(x * directions[j, 0] + y * directions[j, 1] + z * directions[j, 2]) <= sine:
-                lines[count] = j
-                count += 1
-        offsets[a + 1] = count
-    return offsets, lines[:count]
-
-
-@numba.njit(cache=True, nogil=True)
 def match_rays(
     rays: FloatArray,
     offsets: IntArray,
     normals: FloatArray,
-    pairs: tuple[IntArray, IntArray],
+    directions: FloatArray,
     seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
     max_angle_rad: float,
 ) -> tuple[IntArray, FloatArray]:
     """(S,) line that each ray of an arc lies nearest to, -1 for none; (S,) sine of the angle.
 
-    Lines must hold the ray between their ends, and their viewing planes agree with the arc's.
+    Lines must have the arc's direction, hold the ray between their ends, and their viewing planes
+    agree with the arc's.
 
     Args:
         rays: (S, 3) unit, world; those of arc a are offsets[a]:offsets[a + 1].
         offsets: (A + 1,).
         normals: (A, 3) unit, of the arcs, world.
-        pairs: what `alike` found.
+        directions: (L, 3) unit, of the lines.
         seen: what `viewed_lines` found.
-        max_angle_rad: between viewing planes.
+        max_angle_rad: between arcs and lines.
     """
     normal, _, from_start, to_end, sound = seen
     line = np.full(len(rays), -1, np.int64)
     residual = np.zeros(len(rays))
+    sine = np.sin(max_angle_rad)
     cosine = np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD))
     for a in range(len(normals)):
-        for pair in range(pairs[0][a], pairs[0][a + 1]):
-            j = pairs[1][pair]
-            if not sound[j] or abs(_dot(normals[a], normal[j])) < cosine:
+        nx, ny, nz = normals[a]
+        for j in range(len(directions)):
+            # In scalars, and the test that most lines fail first.
+            off = nx * directions[j, 0] + ny * directions[j, 1] + nz * directions[j, 2]
+            if abs(off) > sine or not sound[j]:
                 continue
+            mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
+            if abs(nx * mx + ny * my + nz * mz) < cosine:
+                continue
+            fx, fy, fz = from_start[j, 0], from_start[j, 1], from_start[j, 2]
+            tx, ty, tz = to_end[j, 0], to_end[j, 1], to_end[j, 2]
             for s in range(offsets[a], offsets[a + 1]):
-                if _dot(rays[s], from_start[j]) < -END_SLACK_SINE:
+                x, y, z = rays[s, 0], rays[s, 1], rays[s, 2]
+                if x * fx + y * fy + z * fz < -END_SLACK_SINE:
                     continue
-                if _dot(rays[s], to_end[j]) < -END_SLACK_SINE:
+                if x * tx + y * ty + z * tz < -END_SLACK_SINE:
                     continue
-                off = _dot(rays[s], normal[j])
+                off = x * mx + y * my + z * mz
                 if line[s] < 0 or abs(off) < abs(residual[s]):
                     line[s], residual[s] = j, off
     return line, residual
-
-
-@numba.njit(cache=True, nogil=True)
-def place_scores(
-    rays: FloatArray,
-    offsets: IntArray,
-    weight: FloatArray,
-    normals: FloatArray,
-    segments: FloatArray,
-    directions: FloatArray,
-    places: FloatArray,
-    width_rad: float,
-    max_angle_rad: float,
-) -> FloatArray:
-    """(T,) weight of the rays that lines explain, seen from each of (T, 3) places.
-
-    Rays and normals are in the world's frame: the orientation is the same everywhere.
-    """
-    pairs = alike(normals, directions, max_angle_rad)
-    score = np.zeros(len(places))
-    for t in range(len(places)):
-        seen = viewed_lines(segments, places[t])
-        line, residual = match_rays(rays, offsets, normals, pairs, seen, max_angle_rad)
-        for s in range(len(rays)):
-            if line[s] >= 0:
-                score[t] += weight[s] * np.exp(-0.5 * (residual[s] / width_rad) ** 2)
-    return score
 
 
 @numba.njit(cache=True, nogil=True)
@@ -213,13 +177,16 @@ def match_points(
     nearest = np.full(len(points), np.inf)
     sine = np.sin(max_angle_rad)
     for p in range(len(points)):
+        x, y, z = points[p]
+        dx, dy, dz = directions[p]
+        least = sine
         for a in range(len(normals)):
-            off = abs(_dot(points[p], normals[a]))
-            if off > sine or off > nearest[p] or abs(_dot(directions[p], normals[a])) > sine:
+            nx, ny, nz = normals[a, 0], normals[a, 1], normals[a, 2]
+            off = abs(x * nx + y * ny + z * nz)
+            if off > least or abs(dx * nx + dy * ny + dz * nz) > sine:
                 continue
-            if _dot(points[p], from_start[a]) < -END_SLACK_SINE:
-                continue
-            if _dot(points[p], to_end[a]) < -END_SLACK_SINE:
-                continue
-            nearest[p] = np.arcsin(off)
+            ahead = x * from_start[a, 0] + y * from_start[a, 1] + z * from_start[a, 2]
+            behind = x * to_end[a, 0] + y * to_end[a, 1] + z * to_end[a, 2]
+            if min(ahead, behind) >= -END_SLACK_SINE:
+                least, nearest[p] = off, np.arcsin(off)
     return nearest

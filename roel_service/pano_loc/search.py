@@ -1,4 +1,4 @@
-"""Coarse poses: orientations by aligning shared directions, then places by fields of distances."""
+"""Coarse poses: for every orientation the places that look most like the picture."""
 
 from __future__ import annotations
 
@@ -6,39 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray
+from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
-from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
-from roel_service.geometry.vectors import any_normal, unit
-from roel_service.pano_loc import fields_kernels
+from roel_service.geometry.se3 import SE3
 from roel_service.pano_loc.arcs import PanoramaArcs
-from roel_service.pano_loc.directions import vanishing_directions
-from roel_service.pano_loc.hints import Gravity, PosePrior
-from roel_service.pano_loc.prepare import PreparedMap
+from roel_service.pano_loc.hints import PosePrior
+from roel_service.pano_loc.prepare import BEARING_COUNT, PreparedMap
+from roel_service.pano_loc.views import agreement, pane_of, views_from, widest
 
-# Angles between directions agree this closely when one pair may be the other.
-PAIR_TOLERANCE_RAD = np.deg2rad(3.0)
-# Directions closer than this fix no rotation.
-MIN_PAIR_RAD = np.deg2rad(15.0)
-# Orientations are scored by the arcs they explain: so many of them, this closely.
-SCORED_ARC_COUNT = 300
-EXPLAINED_RAD = np.deg2rad(2.0)
-# Of orientations this close the better one stays; those explaining less than this share of the
-# best go.
-SAME_ROTATION_RAD = np.deg2rad(4.0)
-MIN_EXPLAINED_SHARE = 0.6
-# Widths of the kernel while an orientation is refined.
-REFINE_WIDTHS_RAD = np.deg2rad([4.0, 3.0, 2.0, 1.5, 1.0, 1.0])
-# Around a single direction every orientation is tried in such steps.
-TURN_STEP_RAD = np.deg2rad(4.0)
 # Places within reach of a prior are tried at this spacing.
 PRIOR_STEP_M = 0.25
-# Fields agree where they differ by no more steps (about 5 degrees).
-AGREEMENT_STEPS = 6
-# Arcs belong to a class up to this angle.
-CLASS_SINE = np.sin(np.deg2rad(4.0))
-PLACES_PER_ROTATION = 4
+# Places of one orientation, so far apart.
+PLACES_PER_ROTATION = 6
 SUPPRESSION_M = 0.5
+CONSIDERED_PLACE_COUNT = 60
+# Rounds around the best: the share of the candidates that takes part, and how much finer the grid.
+ROUNDS = ((1.0, 3), (0.35, 3), (0.35, 9))
+FINE_LINE_COUNT, FINE_BEARING_COUNT = 300, 360
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,122 +44,41 @@ class Candidates:
         """The candidates of these indices, or of this mask, in that order."""
         return Candidates(poses=self.poses[index], score=self.score[index])
 
+    def joined(self, other: Candidates) -> Candidates:
+        """These and others."""
+        return Candidates(
+            poses=SE3(
+                rotation=np.concatenate([self.poses.rotation, other.poses.rotation]),
+                translation=np.concatenate([self.poses.translation, other.poses.translation]),
+            ),
+            score=np.concatenate([self.score, other.score]),
+        )
+
     def ranked(self) -> Candidates:
         """Best first."""
         return self.take(np.argsort(-self.score, kind="stable"))
 
 
-def rotation_hypotheses(
-    arcs: PanoramaArcs,
-    prepared: PreparedMap,
-    config: LocalizeConfig,
-    prior: PosePrior | None = None,
-    gravity: Gravity | None = None,
-) -> FloatArray:
-    """(R, 3, 3) rotations R_world_panorama that lay the picture's directions on the map's.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Seeds:
+    """Places in orientations, before they are poses.
 
-    With a prior, those near it, and its own.
+    Attributes:
+        rotation: (C,) index of the orientation.
+        places: (C, 3) m.
+        score: (C,).
     """
-    seen = vanishing_directions(arcs)
-    rotations = _aligned_pairs(seen, prepared.shared)
-    if len(rotations) == 0:
-        rotations = _aligned_singles(seen, prepared.shared)
-    if prior is not None:
-        first = prior.T_world_picture.rotation
-        near = rotations[rotation_angle(rotations @ first.T) < prior.reach_rad]
-        rotations = np.concatenate([near, first[None]])
-    if gravity is not None:
-        rotations = rotations[gravity.agrees(rotations)]
-    if len(rotations) == 0:
-        return rotations
-    few = arcs.take(np.arange(min(len(arcs), SCORED_ARC_COUNT)))
-    rotations, explained = _distinct(rotations, _explained(rotations, few, prepared.shared), config)
-    rotations = _refined(rotations, few, prepared.shared)
-    explained = _explained(rotations, few, prepared.shared)
-    rotations, explained = _distinct(rotations, explained, config)
-    return np.asarray(rotations[explained >= MIN_EXPLAINED_SHARE * explained[0]])
 
+    rotation: IntArray
+    places: FloatArray
+    score: FloatArray
 
-def _aligned_pairs(seen: FloatArray, shared: FloatArray) -> FloatArray:
-    """Rotations that lay two seen directions on two of the map's, with all signs."""
-    rotations = []
-    for i, j in zip(*np.triu_indices(len(seen), k=1), strict=True):
-        for k in range(len(shared)):
-            for m in range(len(shared)):
-                if k == m:
-                    continue
-                for sign in (1.0, -1.0):
-                    pair = (seen[i], sign * seen[j])
-                    angle, other = np.arccos(pair[0] @ pair[1]), np.arccos(shared[k] @ shared[m])
-                    if abs(angle - other) > PAIR_TOLERANCE_RAD:
-                        continue
-                    if not MIN_PAIR_RAD < angle < np.pi - MIN_PAIR_RAD:
-                        continue
-                    target = _frame(shared[k], shared[m])
-                    rotations.append(target.T @ _frame(*pair))
-                    rotations.append(target.T @ _frame(-pair[0], -pair[1]))
-    return np.array(rotations).reshape(-1, 3, 3)
-
-
-def _frame(first: FloatArray, second: FloatArray) -> FloatArray:
-    """(3, 3) rotation with rows along the bisector, across it, and normal to both."""
-    ahead, across = unit(first + second), unit(first - second)
-    return np.stack([ahead, across, np.cross(ahead, across)])
-
-
-def _aligned_singles(seen: FloatArray, shared: FloatArray) -> FloatArray:
-    """Rotations that lay the strongest seen direction on the map's, turned about it in steps."""
-    if len(seen) == 0 or len(shared) == 0:
-        return np.empty((0, 3, 3))
-    turns = rotation_from_vector(np.arange(0.0, 2.0 * np.pi, TURN_STEP_RAD)[:, None] * shared[0])
-    return np.concatenate(
-        [turns @ _basis(shared[0]).T @ _basis(sign * seen[0]) for sign in (1.0, -1.0)]
-    )
-
-
-def _basis(direction: FloatArray) -> FloatArray:
-    """(3, 3) rotation whose first row is the unit direction."""
-    across = any_normal(direction)
-    return np.stack([direction, across, np.cross(direction, across)])
-
-
-def _explained(rotations: FloatArray, arcs: PanoramaArcs, shared: FloatArray) -> FloatArray:
-    """(R,) length of the arcs that have one of the map's directions."""
-    directions = np.einsum("rij,ki->rkj", rotations, shared)
-    sine = np.abs(np.einsum("rkj,aj->rka", directions, arcs.normals)).min(axis=1)
-    return np.asarray(np.exp(-0.5 * (sine / np.sin(EXPLAINED_RAD)) ** 2) @ arcs.length_rad)
-
-
-def _distinct(
-    rotations: FloatArray, explained: FloatArray, config: LocalizeConfig
-) -> tuple[FloatArray, FloatArray]:
-    """The best rotations, each the only one of its neighbourhood, best first."""
-    order = np.argsort(-explained, kind="stable")
-    kept: list[int] = []
-    for index in order:
-        if len(kept) == config.max_rotation_count:
-            break
-        turned_rad = rotation_angle(rotations[kept] @ rotations[index].T)
-        if not (turned_rad < SAME_ROTATION_RAD).any():
-            kept.append(int(index))
-    return rotations[kept], explained[kept]
-
-
-def _refined(rotations: FloatArray, arcs: PanoramaArcs, shared: FloatArray) -> FloatArray:
-    """Rotations after robust least squares of (R n) . d over arcs n and their directions d."""
-    for width_rad in REFINE_WIDTHS_RAD:
-        world = np.einsum("rij,aj->rai", rotations, arcs.normals)
-        sine = world @ shared.T
-        nearest = np.abs(sine).argmin(axis=2)
-        residual = np.take_along_axis(sine, nearest[:, :, None], axis=2)[:, :, 0]
-        jacobian = np.cross(world, shared[nearest])
-        weight = arcs.length_rad / (1.0 + (residual / np.sin(width_rad)) ** 2) ** 2
-        H = np.einsum("ra,rai,raj->rij", weight, jacobian, jacobian)
-        g = np.einsum("ra,ra,rai->ri", weight, residual, jacobian)
-        damping = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        step = -np.linalg.solve(H + damping, g[:, :, None])[:, :, 0]
-        rotations = rotation_from_vector(step) @ rotations
-    return rotations
+    def best(self, count: int) -> _Seeds:
+        """The best ones, best first."""
+        order = np.argsort(-self.score, kind="stable")[:count]
+        return _Seeds(
+            rotation=self.rotation[order], places=self.places[order], score=self.score[order]
+        )
 
 
 def coarse_candidates(
@@ -185,59 +88,82 @@ def coarse_candidates(
     config: LocalizeConfig,
     prior: PosePrior | None = None,
 ) -> Candidates:
-    """The best places for every rotation, and of these the best of all.
+    """Places that agree best with the picture in each orientation, made finer in rounds.
 
-    With a prior, places within its reach.
+    Everything is ranked twice: where all lines can be seen, and where walls hide most of them. With
+    a prior, places within its reach are tried.
     """
-    places, fields = prepared.places, prepared.fields
+    places, step_m, views = prepared.places, prepared.step_m, prepared.views
     if prior is not None:
-        places = _ball(prior.reach_m, PRIOR_STEP_M) + prior.T_world_picture.translation
-        fields = prepared.fields_at(places)
-    chosen_rotation, chosen_place, scores = [], [], []
-    for index, rotation in enumerate(rotations):
-        score = _place_scores(rotation, arcs, prepared, fields)
-        for place in _best_apart(places, score):
-            chosen_rotation.append(index)
-            chosen_place.append(place)
-            scores.append(score[place])
-    found = Candidates(
-        poses=SE3(rotation=rotations[chosen_rotation], translation=places[chosen_place]),
-        score=np.array(scores),
+        step_m = PRIOR_STEP_M
+        places = _ball(prior.reach_m, step_m) + prior.T_world_picture.translation
+        views = views_from(prepared.lines, places, BEARING_COUNT)
+    frames = prepared.lines.frames
+    panes = [pane_of(arcs, rotation, frames, step_m, BEARING_COUNT) for rotation in rotations]
+    scores = agreement(views, panes)
+    found = []
+    for kind in range(scores.shape[2]):
+        seeds = _best_of_all(places, scores[:, :, kind])
+        for share, finer in ROUNDS:
+            seeds = seeds.best(round(share * config.candidate_count / scores.shape[2]))
+            seeds = _moved(seeds, kind, arcs, prepared, rotations, step_m / finer)
+        found.append(seeds)
+    rotation = np.concatenate([seeds.rotation for seeds in found])
+    poses = SE3(
+        rotation=rotations[rotation],
+        translation=np.concatenate([seeds.places for seeds in found]),
     )
-    order = np.argsort(-found.score, kind="stable")
-    # The best place of every rotation comes first: rotations are not decided here.
-    first = np.isin(order, np.unique(chosen_rotation, return_index=True)[1])
-    order = np.concatenate([order[first], order[~first]])[: config.candidate_count]
-    return found.take(order).ranked()
+    return Candidates(poses=poses, score=np.concatenate([_ranks(seeds.score) for seeds in found]))
 
 
-def _place_scores(
-    rotation: FloatArray, arcs: PanoramaArcs, prepared: PreparedMap, fields: Array
-) -> FloatArray:
-    """(T,) agreement of the picture, turned into the world, with the map as seen from places."""
-    count = prepared.channel_count
-    normals = arcs.normals @ rotation.T
-    sine = np.abs(normals @ prepared.shared[:count].T)
-    channel = np.where(sine.min(axis=1) < CLASS_SINE, sine.argmin(axis=1), -1)
-    starts, ends = arcs.starts @ rotation.T, arcs.ends @ rotation.T
-    field = fields_kernels.nearest_arcs(starts, ends, channel, count, prepared.rays)
-    has_class = channel >= 0
-    length = np.bincount(channel[has_class], arcs.length_rad[has_class], minlength=count)
-    weight = length / max(length.sum(), 1e-9)
-    return np.asarray(fields_kernels.agreement(fields, field, weight, AGREEMENT_STEPS))
+def _ranks(score: FloatArray) -> FloatArray:
+    """1 for the best, less for the others: makes the two scores comparable."""
+    rank = np.empty(len(score))
+    rank[np.argsort(-score, kind="stable")] = np.arange(len(score))
+    return 1.0 / (1.0 + rank)
+
+
+def _best_of_all(places: FloatArray, scores: FloatArray) -> _Seeds:
+    """The best places for each orientation, from (R, T) scores."""
+    chosen = [_best_apart(places, score) for score in scores]
+    rotation = np.repeat(np.arange(len(scores)), [len(item) for item in chosen])
+    place = np.concatenate([np.array(item, dtype=np.int64) for item in chosen])
+    return _Seeds(rotation=rotation, places=places[place], score=scores[rotation, place])
 
 
 def _best_apart(places: FloatArray, score: FloatArray) -> list[int]:
     """Indices of the best places, each apart from the better ones."""
+    order = np.argsort(-score, kind="stable")[:CONSIDERED_PLACE_COUNT]
+    near = ((places[order, None] - places[order]) ** 2).sum(axis=2) < SUPPRESSION_M**2
     kept: list[int] = []
-    score = score.copy()
-    while len(kept) < min(PLACES_PER_ROTATION, len(places)):
-        best = int(score.argmax())
-        if score[best] == -np.inf:
-            break
-        kept.append(best)
-        score[np.linalg.norm(places - places[best], axis=1) < SUPPRESSION_M] = -np.inf
-    return kept
+    for index in range(len(order)):
+        if len(kept) < PLACES_PER_ROTATION and not near[index, kept].any():
+            kept.append(index)
+    return [int(index) for index in order[kept]]
+
+
+def _moved(
+    seeds: _Seeds,
+    kind: int,
+    arcs: PanoramaArcs,
+    prepared: PreparedMap,
+    rotations: FloatArray,
+    step_m: float,
+) -> _Seeds:
+    """Each at the best place of a finer grid around it, as one of the two scores says."""
+    axis = step_m * np.array([-1.0, 0.0, 1.0])
+    around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
+    places, scores = seeds.places.copy(), seeds.score.copy()
+    for index in np.unique(seeds.rotation):
+        pane = pane_of(arcs, rotations[index], prepared.lines.frames, step_m, FINE_BEARING_COUNT)
+        for member in np.flatnonzero(seeds.rotation == index):
+            lines = widest(prepared.lines, places[member], FINE_LINE_COUNT)
+            views = views_from(lines, places[member] + around, FINE_BEARING_COUNT)
+            score = agreement(views, [pane])[0, :, kind]
+            best = int(score.argmax())
+            places[member] += around[best]
+            scores[member] = score[best]
+    return _Seeds(rotation=seeds.rotation, places=places, score=scores)
 
 
 def _ball(radius_m: float, step_m: float) -> FloatArray:

@@ -1,0 +1,166 @@
+"""How well a picture in some orientation agrees with what a map shows at places."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.geometry.vectors import unit
+from roel_service.pano_loc import views_kernels
+from roel_service.pano_loc.arcs import PanoramaArcs
+
+# Distances that part the shells, and what stands for each, m: walls hide what is far.
+SHELL_ENDS_M = np.array([1.0, 1.5, 2.0, 3.0, 4.5, 6.5])
+SHELL_MIDDLES_M = np.array([0.7, 1.25, 1.75, 2.5, 3.75, 5.5, 9.0])
+# A line near by is seen with this chance, which falls by e over this distance.
+SEEN_CHANCE, SEEN_REACH_M = 0.5, 2.0
+# No step is painted by chance more rarely than this.
+MIN_SHARE = 0.03
+# Arcs belong to a class up to this angle.
+CLASS_SINE = np.sin(np.deg2rad(4.0))
+# Directions of arcs and of map lines are off by so much.
+DIRECTION_SLACK_RAD = np.deg2rad(1.0)
+# At this distance a picture is painted wide enough for a quarter of a cell of places.
+SLACK_DISTANCE_M = 1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ClassedLines:
+    """Lines of shared directions, in the axes of their classes, longest first.
+
+    Attributes:
+        frames: (K, 3, 3) rows are the axes of each class, the last one its direction.
+        which: (L,) class.
+        feet: (L, 4) across, across, least and greatest along, m.
+    """
+
+    frames: FloatArray
+    which: IntArray
+    feet: FloatArray
+
+    def longest(self, count: int) -> ClassedLines:
+        return ClassedLines(frames=self.frames, which=self.which[:count], feet=self.feet[:count])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Views:
+    """What a map shows at T places: see `views_kernels`.
+
+    Attributes:
+        slots: (T, M) int32 class and bearing.
+        words: (T, M) uint64 elevations.
+        kinds: (T, M) uint8 class and distance.
+        sizes: (T, N) steps that lines of each kind take up.
+        bearing_count: of each class.
+    """
+
+    slots: Array
+    words: Array
+    kinds: Array
+    sizes: FloatArray
+    bearing_count: int
+
+
+def class_frames(shared: FloatArray, frame: FloatArray) -> FloatArray:
+    """(K, 3, 3) axes of (K, 3) unit directions that turn with the map's (3, 3) frame."""
+    frames = np.empty((len(shared), 3, 3))
+    for k, direction in enumerate(shared):
+        axis = frame[np.abs(frame @ direction).argmin()]
+        across = unit(axis - (axis @ direction) * direction)
+        frames[k] = across, np.cross(direction, across), direction
+    return frames
+
+
+def classed_lines(segments: FloatArray, channel: IntArray, frames: FloatArray) -> ClassedLines:
+    """(L, 2, 3) segments, m, of classes of which -1 is none."""
+    members = np.flatnonzero(channel >= 0)
+    which = channel[members]
+    ends = np.einsum("lij,lej->lei", frames[which], segments[members])
+    along = ends[:, :, 2]
+    across = ends[:, :, :2].mean(axis=1)
+    feet = np.column_stack([across, along.min(axis=1), along.max(axis=1)])
+    return ClassedLines(frames=frames, which=which, feet=np.ascontiguousarray(feet))
+
+
+def views_from(lines: ClassedLines, places: FloatArray, bearing_count: int) -> Views:
+    """What lines look like from (T, 3) places, m."""
+    inside = np.ascontiguousarray(np.einsum("kij,tj->tki", lines.frames, places))
+    slots, words, kinds = views_kernels.views(
+        lines.feet, lines.which, inside, bearing_count, SHELL_ENDS_M
+    )
+    return Views(
+        slots=slots,
+        words=words,
+        kinds=kinds,
+        sizes=views_kernels.sizes(words, kinds, len(lines.frames) * len(SHELL_MIDDLES_M)),
+        bearing_count=bearing_count,
+    )
+
+
+def widest(lines: ClassedLines, place: FloatArray, count: int) -> ClassedLines:
+    """The lines that take up most of the sphere, seen from a (3,) place, m."""
+    if len(lines.feet) <= count:
+        return lines
+    inside = np.ascontiguousarray(lines.frames @ place)
+    span_rad = views_kernels.spans(lines.feet, lines.which, inside)
+    chosen = np.argpartition(-span_rad, count)[:count]
+    return ClassedLines(frames=lines.frames, which=lines.which[chosen], feet=lines.feet[chosen])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pane:
+    """A picture in one orientation.
+
+    Attributes:
+        words: (K, B) uint64, painted elevations.
+        share: (N,) chance that a step of each kind of line is painted.
+        gain, loss: (N,) log-likelihood ratios of a step that is painted, and of one that is not.
+    """
+
+    words: Array
+    share: FloatArray
+    gain: FloatArray
+    loss: FloatArray
+
+
+def pane_of(
+    arcs: PanoramaArcs, rotation: FloatArray, frames: FloatArray, step_m: float, bearing_count: int
+) -> Pane:
+    """A picture turned into the world, painted for places that are a step apart."""
+    words = views_kernels.paint(
+        arcs.starts @ rotation.T,
+        arcs.ends @ rotation.T,
+        arcs.normals @ rotation.T,
+        frames,
+        CLASS_SINE,
+        DIRECTION_SLACK_RAD + 0.25 * step_m / SLACK_DISTANCE_M,
+        bearing_count,
+    )
+    share = np.maximum(views_kernels.painted_share(words), MIN_SHARE)[:, None]
+    seen = SEEN_CHANCE * np.exp(-SHELL_MIDDLES_M / SEEN_REACH_M)
+    gain = np.log((seen + (1.0 - seen) * share) / share)
+    loss = np.broadcast_to(np.log(1.0 - seen), gain.shape)
+    return Pane(
+        words=words,
+        share=np.repeat(share[:, 0], len(seen)),
+        gain=gain.ravel(),
+        loss=loss.ravel(),
+    )
+
+
+def agreement(views: Views, panes: Sequence[Pane]) -> FloatArray:
+    """(R, T, 2) scores of places in R orientations: beyond chance, and by likelihood.
+
+    The first is right where all lines can be seen, the second where walls hide most of them.
+    """
+    share, gain, loss = (
+        np.stack([getattr(pane, name) for pane in panes]) for name in ("share", "gain", "loss")
+    )
+    words = np.stack([pane.words.ravel() for pane in panes])
+    total = views_kernels.painted_steps(views.slots, views.words, views.kinds, words, gain - loss)
+    size = np.maximum(views.sizes.sum(axis=1), 1.0)
+    excess = (total[:, :, 0] - share @ views.sizes.T) / np.sqrt(size)
+    return np.stack([excess, total[:, :, 1] + loss @ views.sizes.T], axis=2)
