@@ -40,24 +40,31 @@ class UploadFigures:
 
 
 class RepeatedRecording:
-    """A recording in memory, again and again, until it has a number of events."""
+    """A recording in memory, again and again, until it has a number of events.
+
+    All of it is there before anything is measured: making events is not the upload's work.
+    """
 
     def __init__(self, chunks: list[EventStream], event_count: int) -> None:
         self.width, self.height = chunks[0].width, chunks[0].height
         self.time_range_us = None
-        self._chunks = chunks
-        self._event_count = event_count
+        self._chunks = list(_repeated(chunks, event_count))
 
     def chunks(self) -> Iterator[EventStream]:
-        """Chunks in the order of time, each repetition after the one before."""
-        left_count = self._event_count
-        period_us = int(self._chunks[-1].t_us[-1] - self._chunks[0].t_us[0]) + 1
-        for turn in itertools.count():
-            for chunk in self._chunks:
-                if left_count <= 0:
-                    return
-                yield _shifted(chunk, turn * period_us, left_count)
-                left_count -= len(chunk)
+        """Chunks in the order of time."""
+        yield from self._chunks
+
+
+def _repeated(chunks: list[EventStream], event_count: int) -> Iterator[EventStream]:
+    """Each repetition after the one before."""
+    left_count = event_count
+    period_us = int(chunks[-1].t_us[-1] - chunks[0].t_us[0]) + 1
+    for turn in itertools.count():
+        for chunk in chunks:
+            if left_count <= 0:
+                return
+            yield _shifted(chunk, turn * period_us, left_count)
+            left_count -= len(chunk)
 
 
 def _shifted(chunk: EventStream, offset_us: int, count: int) -> EventStream:
@@ -114,9 +121,9 @@ def main() -> None:
     options = parser.parse_args()
     camera = read_camera(options.camera, None)
     chunks = list(open_events(options.recording, camera.width, camera.height).chunks())
+    source = RepeatedRecording(chunks, options.events)
     for _ in range(options.runs):
         with tempfile.TemporaryDirectory(dir=options.data) as folder:
-            source = RepeatedRecording(chunks, options.events)
             print(json.dumps(vars(measure_upload(source, camera, Path(folder) / "data"))))
 
 

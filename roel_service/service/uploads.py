@@ -1,4 +1,4 @@
-"""Uploads: received ahead, checked in threads, made durable in groups, acknowledged.
+"""Uploads: received ahead, checked in a thread, made durable in groups, acknowledged.
 
 One call is one `Upload`. What it fills, a recording or a blob, is its `Sink`.
 """
@@ -6,8 +6,7 @@ One call is one `Upload`. What it fills, a recording or a blob, is its `Sink`.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
@@ -43,16 +42,19 @@ class Sink(Protocol[Item, Status]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Received(Generic[Item]):
-    """A request that is being checked."""
+class _Checked(Generic[Item]):
+    """What a sound request carries."""
 
+    item: Item
     cost: int
     size_bytes: int
-    checking: asyncio.Task[Item]
 
 
 class Upload(Generic[Item, Status]):
     """One call that uploads.
+
+    Requests are received, checked and made durable side by side, each by as many at a time as
+    there are: handing over one by one between threads would take as long as the work.
 
     A group is made durable when its first item is `commit_interval_s` old, when it is large, or
     when the client may be waiting for it. The items before a faulty one are made durable before
@@ -65,92 +67,117 @@ class Upload(Generic[Item, Status]):
         self._requests = requests
         self._sink = sink
         self._settings = settings
-        self._received: deque[_Received[Item]] = deque()
+        self._received: list[Any] = []
+        self._checked: list[_Checked[Item]] = []
         self._under_way = 0
-        self._changed = asyncio.Event()
+        self._has_received = asyncio.Event()
+        self._has_checked = asyncio.Event()
         self._end: RoelError | None = None
 
     def end(self, error: RoelError) -> None:
         """Let the call end with an error; what is under way is not made durable."""
         self._end = error
-        self._changed.set()
+        self._has_checked.set()
 
     async def statuses(self) -> AsyncIterator[Status]:
         """The status after each group that became durable."""
-        receiving = asyncio.create_task(self._receive())
-        receiving.add_done_callback(self._note)
+        receiving = _noted(self._receive(), self._has_received)
+        checking = _noted(self._check(receiving), self._has_checked)
         try:
-            while await self._has_next(receiving):
-                await self._until_worthwhile(receiving)
-                yield await self._commit(self._take())
+            while await self._has_group(checking):
+                yield await self._commit()
         finally:
             receiving.cancel()
+            checking.cancel()
 
     async def _receive(self) -> None:
         while (request := await next_request(self._requests, self._settings)) is not None:
-            cost = self._sink.cost(request)
-            self._under_way += cost
+            self._under_way += self._sink.cost(request)
             if self._under_way > self._sink.credit:
                 expected = f"at most {self._sink.credit} that are not acknowledged"
                 found = f"{self._under_way}"
                 raise LimitError("upload", expected, found, reason="CREDIT_EXCEEDED")
-            checking = asyncio.create_task(asyncio.to_thread(self._sink.check, request))
-            checking.add_done_callback(self._note)
-            size_bytes = self._sink.size_bytes(request)
-            self._received.append(_Received(cost=cost, size_bytes=size_bytes, checking=checking))
+            self._received.append(request)
+            self._has_received.set()
 
-    def _note(self, task: asyncio.Task[Any]) -> None:
-        """A task ended; looking at its error keeps asyncio from logging one that nobody awaits."""
-        if not task.cancelled():
-            task.exception()
-        self._changed.set()
+    async def _check(self, receiving: asyncio.Task[None]) -> None:
+        """Check what was received; raises what is wrong with it, or why nothing more comes."""
+        while await self._has_requests(receiving):
+            requests, self._received = self._received, []
+            checked, error = await asyncio.to_thread(self._sound, requests)
+            self._checked += checked
+            self._has_checked.set()
+            if error is not None:
+                raise error
 
-    async def _has_next(self, receiving: asyncio.Task[None]) -> bool:
-        """Whether an item waits to be committed; raises why the call has to end."""
-        while True:
-            self._changed.clear()
-            if self._end is not None:
-                raise self._end
-            if self._received and self._received[0].checking.done():
-                return True
-            if not self._received and receiving.done():
+    async def _has_requests(self, receiving: asyncio.Task[None]) -> bool:
+        while not self._received:
+            if receiving.done():
                 receiving.result()
                 return False
-            await self._changed.wait()
+            self._has_received.clear()
+            await self._has_received.wait()
+        return True
 
-    async def _until_worthwhile(self, receiving: asyncio.Task[None]) -> None:
-        clock = asyncio.get_running_loop()
-        deadline_s = clock.time() + self._settings.commit_interval_s
-        while not self._is_worthwhile(receiving):
-            self._changed.clear()
+    def _sound(self, requests: list[Any]) -> tuple[list[_Checked[Item]], RoelError | None]:
+        """The requests before the first faulty one, and what is wrong with that."""
+        checked = []
+        for request in requests:
             try:
-                await asyncio.wait_for(self._changed.wait(), deadline_s - clock.time())
-            except TimeoutError:
-                return
+                item = self._sink.check(request)
+            except RoelError as error:
+                return checked, error
+            cost, size_bytes = self._sink.cost(request), self._sink.size_bytes(request)
+            checked.append(_Checked(item=item, cost=cost, size_bytes=size_bytes))
+        return checked, None
 
-    def _is_worthwhile(self, receiving: asyncio.Task[None]) -> bool:
+    async def _has_group(self, checking: asyncio.Task[None]) -> bool:
+        """Wait for items that are worth a commit; raises why the call has to end."""
+        clock = asyncio.get_running_loop()
+        due_s: float | None = None
+        while not self._is_worthwhile(checking):
+            if due_s is None and self._checked:
+                due_s = clock.time() + self._settings.commit_interval_s
+            self._has_checked.clear()
+            try:
+                async with asyncio.timeout_at(due_s):
+                    await self._has_checked.wait()
+            except TimeoutError:
+                break
+        if self._end is not None:
+            raise self._end
+        if not self._checked:
+            checking.result()
+        return bool(self._checked)
+
+    def _is_worthwhile(self, checking: asyncio.Task[None]) -> bool:
         """Whether more than what is checked is not to be waited for."""
-        checked = [item for item in self._received if item.checking.done()]
         return (
             self._end is not None
-            or sum(item.size_bytes for item in checked) >= self._settings.commit_bytes
-            or sum(item.cost for item in checked) * 2 >= self._sink.credit
-            or (receiving.done() and len(checked) == len(self._received))
+            or checking.done()
+            or sum(item.size_bytes for item in self._checked) >= self._settings.commit_bytes
+            or sum(item.cost for item in self._checked) * 2 >= self._sink.credit
         )
 
-    def _take(self) -> list[_Received[Item]]:
-        """The sound items at the head; raises what is wrong with the first if it is not sound."""
-        self._received[0].checking.result()
-        group = []
-        while self._received and _is_sound(self._received[0].checking):
-            group.append(self._received.popleft())
-        return group
-
-    async def _commit(self, group: list[_Received[Item]]) -> Status:
-        items = [item.checking.result() for item in group]
-        status = await asyncio.to_thread(self._sink.commit, items)
-        self._under_way -= sum(item.cost for item in group)
+    async def _commit(self) -> Status:
+        group, self._checked = self._checked, []
+        status = await asyncio.to_thread(self._sink.commit, [checked.item for checked in group])
+        self._under_way -= sum(checked.cost for checked in group)
         return status
+
+
+def _noted(work: Coroutine[Any, Any, None], ended: asyncio.Event) -> asyncio.Task[None]:
+    """A task that sets an event when it ends."""
+
+    def note(task: asyncio.Task[None]) -> None:
+        # Looking at the error keeps asyncio from logging one that nobody awaits.
+        if not task.cancelled():
+            task.exception()
+        ended.set()
+
+    task = asyncio.create_task(work)
+    task.add_done_callback(note)
+    return task
 
 
 class OpenUploads:
@@ -210,7 +237,3 @@ def request_part(request: Any, name: str) -> Any:
     if found != name:
         raise InputError("upload", f"a message with {name}", f"{found}", reason="UPLOAD_ORDER")
     return getattr(request, name)
-
-
-def _is_sound(checking: asyncio.Task[Any]) -> bool:
-    return checking.done() and checking.exception() is None

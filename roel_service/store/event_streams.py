@@ -13,7 +13,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, RowMapping, delete, exists, insert, select, update
+from sqlalchemy import (
+    Connection,
+    RowMapping,
+    bindparam,
+    delete,
+    exists,
+    insert,
+    select,
+    update,
+)
 
 from roel_service.errors import (
     ConflictError,
@@ -45,6 +54,17 @@ from roel_service.store.requests import RequestId, once, recall, row_memory
 from roel_service.store.schema import EVENT_CHUNK, EVENT_STREAM, OPERATION, POSE_PART
 
 _MEMORY = row_memory(event_stream_from_row)
+
+# What appending does fifty times a second; made once, because that takes longer than executing it.
+_SELECT_STREAM = select(EVENT_STREAM).where(EVENT_STREAM.c.id == bindparam("stream_id"))
+_INSERT_CHUNKS = insert(EVENT_CHUNK)
+_GROWING = ("chunk_count", "event_count", "size_bytes", "start_us", "end_us", "longest_gap_us")
+_GROW = (
+    update(EVENT_STREAM)
+    .where(EVENT_STREAM.c.uid == bindparam("of_uid"))
+    .values({name: bindparam(name) for name in _GROWING})
+    .returning(EVENT_STREAM.c.pose_count)
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,10 +202,11 @@ class EventStreams:
             _check_size(rows[-1], max_size_bytes)
             self._recordings.append(record.uid, record.size_bytes, (chunk.data for chunk in fresh))
             with self._database.write() as connection:
-                connection.execute(insert(EVENT_CHUNK), rows)
+                connection.execute(_INSERT_CHUNKS, rows)
+                grown = _grown(record, fresh)
                 # Poses may have come meanwhile; the chunks are still those of `record`.
-                current = _get(connection, stream_id)
-                return _update(connection, current, **_grown(record, fresh))
+                pose_count = connection.execute(_GROW, {"of_uid": record.uid, **grown}).scalar_one()
+            return dataclasses.replace(record, pose_count=pose_count, **grown)
 
     def append_poses(
         self, stream_id: str, part: PosePart, max_pose_count: int
@@ -369,8 +390,7 @@ def get_mappable(connection: Connection, stream_id: str, *, may_be_open: bool) -
 
 
 def _row(connection: Connection, stream_id: str) -> RowMapping | None:
-    query = select(EVENT_STREAM).where(EVENT_STREAM.c.id == stream_id)
-    return connection.execute(query).mappings().one_or_none()
+    return connection.execute(_SELECT_STREAM, {"stream_id": stream_id}).mappings().one_or_none()
 
 
 def _get(connection: Connection, stream_id: str) -> EventStreamRecord:

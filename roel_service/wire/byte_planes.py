@@ -21,7 +21,8 @@ def write_planes(values: Array, byte_count: int, planes: Array) -> None:
     """Write the lowest bytes of (K,) non-negative integers to (byte_count * K,) uint8."""
     # Shift and cast, here and below: several times faster than transposing bytes.
     for plane, part in enumerate(planes.reshape(byte_count, -1)):
-        part[:] = values >> values.dtype.type(8 * plane) if plane else values.astype(np.uint8)
+        shifted = values >> values.dtype.type(8 * plane) if plane else values
+        np.copyto(part, shifted, casting="unsafe")
 
 
 def integers_from_planes(planes: Array, byte_count: int) -> Array:
@@ -37,19 +38,25 @@ def integers_from_planes(planes: Array, byte_count: int) -> Array:
 
 def sum_of_planes(planes: Array, byte_count: int) -> int:
     """Sum of the integers behind byte planes; fewer than 2^24 of them."""
-    # 32 bits hold the sum of so many bytes, and are added up twice as fast as 64.
-    sums = planes.reshape(byte_count, -1).sum(axis=1, dtype=np.uint32)
-    return sum(int(value) << 8 * plane for plane, value in enumerate(sums))
+    total = 0
+    for index, plane in enumerate(planes.reshape(byte_count, -1)):
+        # The upper planes are often empty, which is told ten times faster than their sum. 32 bits
+        # hold the sum of so many bytes, and are added up twice as fast as 64.
+        if plane.max():
+            total += int(plane.sum(dtype=np.uint32)) << 8 * index
+    return total
 
 
 def largest_of_planes(planes: Array, byte_count: int) -> int:
     """Largest of the integers behind byte planes, found from the highest byte down."""
-    *lower, highest = planes.reshape(byte_count, -1)
-    largest = int(highest.max())
-    candidates = highest == largest
-    for plane in reversed(lower):
-        kept = plane * candidates
+    largest = 0
+    # 1 for every integer with the bytes found so far, 0 for the others; None as long as all have them.
+    candidates: Array | None = None
+    for plane in reversed(planes.reshape(byte_count, -1)):
+        kept = plane if candidates is None else plane * candidates
         top = int(kept.max())
-        candidates &= kept == top
+        if top:
+            # All others are 0 there, or were left out before.
+            candidates = (kept == top).view(np.uint8)
         largest = largest << 8 | top
     return largest

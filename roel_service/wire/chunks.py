@@ -10,6 +10,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -103,24 +104,44 @@ def split_chunks(source: EventSource) -> Iterator[EventStream]:
 
     The cuts depend on the events alone, not on the chunks in which the source delivers them.
     """
-    rest: EventStream | None = None
+    # Fewer events than a chunk takes, without a jump.
+    waiting: list[EventStream] = []
+    for run in _runs(source):
+        if waiting and _is_jump(waiting[-1].t_us[-1], run.t_us[0]):
+            yield _joined(waiting)
+            waiting = []
+        start = min(len(run), MAX_CHUNK_EVENT_COUNT - sum(map(len, waiting)))
+        waiting.append(run.part(0, start))
+        while sum(map(len, waiting)) == MAX_CHUNK_EVENT_COUNT:
+            yield _joined(waiting)
+            stop = min(len(run), start + MAX_CHUNK_EVENT_COUNT)
+            waiting = [run.part(start, stop)] if start < stop else []
+            start = stop
+    if waiting:
+        yield _joined(waiting)
+
+
+def _runs(source: EventSource) -> Iterator[EventStream]:
+    """The events of a source in parts without jumps."""
     for chunk in source.chunks():
-        events = chunk if rest is None else concatenate([rest, chunk])
-        jumps = np.flatnonzero(np.diff(events.t_us) > MAX_STEP_US) + 1
-        start = 0
-        for jump in jumps.tolist():
-            yield from _pieces(events, start, jump)
-            start = jump
-        stop = start + (len(events) - start) // MAX_CHUNK_EVENT_COUNT * MAX_CHUNK_EVENT_COUNT
-        yield from _pieces(events, start, stop)
-        rest = events.part(stop, len(events)) if stop < len(events) else None
-    if rest is not None:
-        yield rest
+        if len(chunk) == 0:
+            continue
+        cuts = [0, len(chunk)]
+        # Hardly any recording is long enough for a jump; looking for one costs a pass over all.
+        if _is_jump(chunk.t_us[0], chunk.t_us[-1]):
+            jumps = np.flatnonzero(np.diff(chunk.t_us) > MAX_STEP_US) + 1
+            cuts[1:1] = jumps.tolist()
+        for start, stop in pairwise(cuts):
+            yield chunk.part(start, stop)
 
 
-def _pieces(events: EventStream, start: int, stop: int) -> Iterator[EventStream]:
-    for first in range(start, stop, MAX_CHUNK_EVENT_COUNT):
-        yield events.part(first, min(first + MAX_CHUNK_EVENT_COUNT, stop))
+def _is_jump(before_us: int, after_us: int) -> bool:
+    """Whether two neighbours are too far apart for one chunk."""
+    return after_us - before_us > MAX_STEP_US
+
+
+def _joined(parts: list[EventStream]) -> EventStream:
+    return parts[0] if len(parts) == 1 else concatenate(parts)
 
 
 def encode_chunk(events: EventStream) -> bytes:
@@ -132,15 +153,10 @@ def encode_chunk(events: EventStream) -> bytes:
     count = len(events)
     if not 1 <= count <= MAX_CHUNK_EVENT_COUNT:
         raise _malformed(f"1 to {MAX_CHUNK_EVENT_COUNT} events", f"{count}")
-    steps_us = np.zeros(count, np.int64)
-    np.subtract(events.t_us[1:], events.t_us[:-1], out=steps_us[1:])
-    longest_us = int(steps_us.max())
-    if longest_us > MAX_STEP_US:
-        raise _malformed(f"steps of at most {MAX_STEP_US} us", f"{longest_us} us")
-    width_bytes = 2 if longest_us < 2**16 else 4
+    steps_us, width_bytes = _steps(events.t_us)
     payload_bytes = _payload_bytes(width_bytes, count)
     planes = _parted(np.empty(payload_bytes, np.uint8), width_bytes, count)
-    write_planes(steps_us.astype(f"u{width_bytes}"), width_bytes, planes.steps)
+    write_planes(steps_us, width_bytes, planes.steps)
     write_planes(events.x, 2, planes.x)
     write_planes(events.y, 2, planes.y)
     planes.signs[:] = np.packbits(events.polarity > 0, bitorder="little")
@@ -164,6 +180,25 @@ def encode_chunk(events: EventStream) -> bytes:
         )
     )
     return header + _CRC.pack(zlib.crc32(header)) + payload
+
+
+def _steps(t_us: IntArray) -> tuple[Array, int]:
+    """(K,) unsigned steps between neighbours, the first one 0, and how many bytes they take.
+
+    Raises:
+        EventsError: CHUNK_MALFORMED, a step above `MAX_STEP_US`.
+    """
+    duration_us = int(t_us[-1]) - int(t_us[0])
+    for width_bytes in (2, 4):
+        # Steps modulo 256^width, several times faster than in 64 bits; one that is cut is missing in
+        # the sum.
+        lowest = t_us.astype(f"u{width_bytes}")
+        steps_us = np.zeros_like(lowest)
+        np.subtract(lowest[1:], lowest[:-1], out=steps_us[1:])
+        if int(steps_us.sum(dtype=np.uint64)) == duration_us:
+            return steps_us, width_bytes
+    longest_us = int(np.diff(t_us).max())
+    raise _malformed(f"steps of at most {MAX_STEP_US} us", f"{longest_us} us")
 
 
 def decode_chunk(data: bytes, *, previous_t1_us: int | None) -> EventStream:
