@@ -30,11 +30,11 @@ class EventSink:
     def cost(self, request: events_pb2.AppendEventsRequest) -> int:
         return 1
 
-    def size_bytes(self, request: events_pb2.AppendEventsRequest) -> int:
-        return len(request.chunk.data)
-
     def check(self, request: events_pb2.AppendEventsRequest) -> Chunk:
         return _checked_chunk(request_part(request, "chunk"), self._record.camera)
+
+    def size_bytes(self, item: Chunk) -> int:
+        return item.length
 
     def commit(self, items: list[Chunk]) -> events_pb2.AppendStatus:
         self._record = self._streams.append_chunks(
@@ -62,7 +62,9 @@ class EventSink:
 
 def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:
     """A chunk that is sound by itself; the order of chunks is the store's to check."""
-    summary = check_chunk(message.data)
+    # Every look at a field of bytes is a copy.
+    data = message.data
+    summary = check_chunk(data)
     if (summary.width, summary.height) != (camera.width, camera.height):
         expected = f"events of a {camera.width}x{camera.height} sensor, as the camera's"
         found = f"{summary.width}x{summary.height}"
@@ -73,9 +75,9 @@ def _checked_chunk(message: events_pb2.EventChunk, camera: Camera) -> Chunk:
         t1_us=summary.t1_us,
         event_count=summary.event_count,
         longest_step_us=summary.longest_step_us,
-        length=len(message.data),
-        data=message.data,
-        sha256=hashlib.sha256(message.data).hexdigest(),
+        length=len(data),
+        data=data,
+        sha256=hashlib.sha256(data).hexdigest(),
     )
 
 

@@ -78,8 +78,8 @@ class BlobServicer:
         size = self._settings.blob_part_bytes
         for offset in range(start, stop, size):
             length = min(size, stop - offset)
-            data = await asyncio.to_thread(_read, self._uploads.path(blob), offset, length)
-            digest.update(data)
+            path = self._uploads.path(blob)
+            data = await asyncio.to_thread(_read, path, offset, length, digest)
             yield blobs_pb2.ReadBlobResponse(data=data)
         if (start, stop) == (0, blob.size_bytes) and digest.hexdigest() != blob.sha256:
             raise CorruptionError(f"blob {blob.sha256}", "bytes of that digest", digest.hexdigest())
@@ -122,17 +122,18 @@ class BlobSink:
         self._settings = settings
 
     def cost(self, request: blobs_pb2.WriteBlobRequest) -> int:
-        return self.size_bytes(request)
-
-    def size_bytes(self, request: blobs_pb2.WriteBlobRequest) -> int:
         return len(request.data.data)
 
     def check(self, request: blobs_pb2.WriteBlobRequest) -> Part | None:
         if request.WhichOneof("part") == "finish":
             return None
-        part: blobs_pb2.BlobPart = request_part(request, "data")
-        _check_part(part, self._settings.blob_part_bytes)
-        return Part(offset=part.offset, data=part.data)
+        message: blobs_pb2.BlobPart = request_part(request, "data")
+        part = Part(offset=message.offset, data=message.data)
+        _check_part(part, message.crc32, self._settings.blob_part_bytes)
+        return part
+
+    def size_bytes(self, item: Part | None) -> int:
+        return 0 if item is None else len(item.data)
 
     def commit(self, items: list[Part | None]) -> blobs_pb2.WriteStatus:
         parts = [part for part in items if part is not None]
@@ -143,13 +144,13 @@ class BlobSink:
         return _under_way(self._record, self._settings)
 
 
-def _check_part(part: blobs_pb2.BlobPart, max_bytes: int) -> None:
+def _check_part(part: Part, crc32: int, max_bytes: int) -> None:
     if len(part.data) > max_bytes:
         expected = f"at most {max_bytes} bytes"
         raise LimitError("part", expected, f"{len(part.data)}", reason="BLOB_TOO_LARGE")
     found = zlib.crc32(part.data)
-    if found != part.crc32:
-        expected = f"bytes of CRC {part.crc32:#010x}"
+    if found != crc32:
+        expected = f"bytes of CRC {crc32:#010x}"
         raise InputError("part", expected, f"{found:#010x}", reason="PART_CRC_MISMATCH")
 
 
@@ -164,10 +165,13 @@ def _range(request: blobs_pb2.ReadBlobRequest, blob: BlobRecord) -> tuple[int, i
     return request.offset, min(request.offset + length, blob.size_bytes)
 
 
-def _read(path: Path, offset: int, length: int) -> bytes:
+def _read(path: Path, offset: int, length: int, digest: Any) -> bytes:
+    """Part of a file, which is added to a digest."""
     with path.open("rb") as file:
         file.seek(offset)
-        return file.read(length)
+        data = file.read(length)
+    digest.update(data)
+    return data
 
 
 def _whole(blob: BlobRecord) -> blobs_pb2.WriteStatus:

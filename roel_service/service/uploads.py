@@ -31,11 +31,11 @@ class Sink(Protocol[Item, Status]):
     def cost(self, request: Any) -> int:
         """What a request takes of the credit until it is durable."""
 
-    def size_bytes(self, request: Any) -> int:
-        """How much a request carries."""
-
     def check(self, request: Any) -> Item:
         """What a request carries, once it is known to be sound; raises `RoelError`."""
+
+    def size_bytes(self, item: Any) -> int:
+        """How much that is."""
 
     def commit(self, items: list[Item]) -> Status:
         """Make items durable, in their order; raises `RoelError`."""
@@ -67,7 +67,8 @@ class Upload(Generic[Item, Status]):
         self._requests = requests
         self._sink = sink
         self._settings = settings
-        self._received: list[Any] = []
+        # What costs so much of the credit.
+        self._received: list[tuple[Any, int]] = []
         self._checked: list[_Checked[Item]] = []
         self._under_way = 0
         self._has_received = asyncio.Event()
@@ -92,12 +93,13 @@ class Upload(Generic[Item, Status]):
 
     async def _receive(self) -> None:
         while (request := await next_request(self._requests, self._settings)) is not None:
-            self._under_way += self._sink.cost(request)
+            cost = self._sink.cost(request)
+            self._under_way += cost
             if self._under_way > self._sink.credit:
                 expected = f"at most {self._sink.credit} that are not acknowledged"
                 found = f"{self._under_way}"
                 raise LimitError("upload", expected, found, reason="CREDIT_EXCEEDED")
-            self._received.append(request)
+            self._received.append((request, cost))
             self._has_received.set()
 
     async def _check(self, receiving: asyncio.Task[None]) -> None:
@@ -119,15 +121,15 @@ class Upload(Generic[Item, Status]):
             await self._has_received.wait()
         return True
 
-    def _sound(self, requests: list[Any]) -> tuple[list[_Checked[Item]], RoelError | None]:
+    def _sound(self, requests: list[tuple[Any, int]]) -> tuple[list[_Checked[Item]], RoelError | None]:
         """The requests before the first faulty one, and what is wrong with that."""
         checked = []
-        for request in requests:
+        for request, cost in requests:
             try:
                 item = self._sink.check(request)
             except RoelError as error:
                 return checked, error
-            cost, size_bytes = self._sink.cost(request), self._sink.size_bytes(request)
+            size_bytes = self._sink.size_bytes(item)
             checked.append(_Checked(item=item, cost=cost, size_bytes=size_bytes))
         return checked, None
 

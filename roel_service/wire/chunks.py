@@ -267,8 +267,8 @@ def _payload_bytes(width_bytes: int, count: int) -> int:
 
 def _parted(payload: Array, width_bytes: int, count: int) -> _Planes:
     """A decompressed payload with views of its parts."""
-    ends = np.cumsum([width_bytes * count, 2 * count, 2 * count])
-    return _Planes(payload, *np.split(payload, ends))
+    x, y, signs = (width * count for width in (width_bytes, width_bytes + 2, width_bytes + 4))
+    return _Planes(payload, payload[:x], payload[x:y], payload[y:signs], payload[signs:])
 
 
 def _is_sound(header: _Header, planes: _Planes) -> bool:

@@ -24,8 +24,8 @@ class Sink:
     def cost(self, request):
         return 1
 
-    def size_bytes(self, request):
-        return request
+    def size_bytes(self, item):
+        return item
 
     def check(self, request):
         time.sleep(self._check_s)
