@@ -121,9 +121,11 @@ class Upload(Generic[Item, Status]):
             await self._has_received.wait()
         return True
 
-    def _sound(self, requests: list[tuple[Any, int]]) -> tuple[list[_Checked[Item]], RoelError | None]:
+    def _sound(
+        self, requests: list[tuple[Any, int]]
+    ) -> tuple[list[_Checked[Item]], RoelError | None]:
         """The requests before the first faulty one, and what is wrong with that."""
-        checked = []
+        checked: list[_Checked[Item]] = []
         for request, cost in requests:
             try:
                 item = self._sink.check(request)

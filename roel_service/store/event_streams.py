@@ -487,7 +487,7 @@ def _check_size(last_row: dict[str, Any], max_size_bytes: int) -> None:
         raise LimitError("event stream", expected, f"{size_bytes}", reason=reason)
 
 
-def _grown(record: EventStreamRecord, chunks: Sequence[ChunkFacts]) -> dict[str, int]:
+def _grown(record: EventStreamRecord, chunks: Sequence[ChunkFacts]) -> dict[str, Any]:
     """What changes in a record when chunks are appended."""
     ends_us = [record.end_us if record.chunk_count else chunks[0].t0_us]
     ends_us += [chunk.t1_us for chunk in chunks]
