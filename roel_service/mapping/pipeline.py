@@ -7,14 +7,11 @@ from collections.abc import Callable
 import numpy as np
 
 from roel_service.config.stages import Config
-from roel_service.mapping.cached_stages import CachedStages, triangulation_cost
+from roel_service.mapping.cached_stages import CachedStages
 from roel_service.mapping.curves import with_curves
 from roel_service.mapping.detect import LineDetector, line_detector
 from roel_service.mapping.directions import direction_prior
-from roel_service.mapping.evidence import Evidence
-from roel_service.mapping.frames import (
-    Frames,
-)
+from roel_service.mapping.first_lines import matched_tracks, triangulated_lines
 from roel_service.mapping.front_end import (
     NO_KNOWN_FRAMES,
     Detected,
@@ -22,24 +19,19 @@ from roel_service.mapping.front_end import (
     lines_of_all_frames,
 )
 from roel_service.mapping.match_global import reassociate
-from roel_service.mapping.match_local import match_adjacent_frames
-from roel_service.mapping.match_points import PointLineMatcher, PointMatcher, point_matcher
+from roel_service.mapping.match_points import point_matcher
 from roel_service.mapping.match_sampled import (
-    GeometricMatcher,
     LineMatcher,
-    match_sampled_frames,
 )
-from roel_service.mapping.merge import merge_duplicates
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.stage_cache import NoCache, StageCache
-from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.trim import trim_to_segments
 from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
-from roel_service.scene.lines import LineMap, LineTracks
+from roel_service.scene.lines import LineMap
 from roel_service.scene.results import MappingReport, MappingResult, TrackStatus
 from roel_service.scene.trajectory import Trajectory
 
@@ -105,9 +97,9 @@ def build_line_map(
         return lines_of_all_frames(counted, trajectory, camera, config, detector, run, known)
 
     def triangulate() -> Refined:
-        tracks = _tracks(detected, config, matcher, points, run)
+        tracks = matched_tracks(detected, config, matcher, points, run)
         with run.stage("triangulate"):
-            return _triangulate(tracks, evidence, frames, config, rng, run)
+            return triangulated_lines(tracks, evidence, frames, config, rng, run)
 
     def associate_again() -> Refined:
         with run.stage("match_global"):
@@ -149,51 +141,3 @@ def build_line_map(
             seconds=run.seconds,
         ),
     )
-
-
-def _tracks(
-    detected: Detected,
-    config: Config,
-    matcher: LineMatcher | None,
-    points: PointMatcher | None,
-    run: MappingRun,
-) -> LineTracks:
-    """Observations of adjacent frames and, if configured, of distant ones that show one line."""
-    frames, views = detected.frames, detected.evidence.views
-    with run.stage("match_local"):
-        tracks = match_adjacent_frames(
-            detected.observations,
-            frames,
-            config.match_local,
-            rotation_is_undone=config.frames.compensate_rotation,
-        )
-    if config.match_global.method != "sampled":
-        return tracks
-    with run.stage("match_global"):
-        matcher = matcher or (
-            PointLineMatcher(points, detected.images, views, config.match_global)
-            if points
-            else GeometricMatcher(tracks, views, frames, config)
-        )
-        return match_sampled_frames(tracks, views, frames, config, matcher, run.step)
-
-
-def _triangulate(
-    tracks: LineTracks,
-    evidence: Evidence,
-    frames: Frames,
-    config: Config,
-    rng: np.random.Generator,
-    run: MappingRun,
-) -> Refined:
-    """First 3D lines, refined over their inliers and, if configured, without duplicates."""
-    found = triangulate_tracks(tracks, evidence.views, frames, config.triangulate, rng)
-    run.count([status for status in found.statuses if status is not TrackStatus.TRIANGULATED])
-    refined = run.without_diverged(
-        refine_lines(found.lines, found.tracks, evidence, frames, triangulation_cost(config))
-    )
-    if not config.triangulate.merge:
-        return refined
-    refined, merged = merge_duplicates(refined, evidence.views, frames, config.triangulate)
-    run.count(merged)
-    return refined

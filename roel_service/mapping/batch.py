@@ -1,0 +1,312 @@
+"""The published batch: all lines and one free pose a frame at once, the first pose held.
+
+Paper: "Multi-view Line Optimization" with free poses, and "Pose Refinement". The line term is the
+plane-to-line residual or, to compare with, LIMAP's reprojection; the event term is the angle
+between the events' rays and the plane that the frame's camera spans with the line. Nothing holds
+the scale but the start, and damping. Damped Gauss-Newton over all unknowns together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import linalg, sparse
+
+from roel_service.arrays import FloatArray, IntArray
+from roel_service.config.stages import RefineConfig
+from roel_service.errors import LimitError
+from roel_service.geometry import grassmann, plucker, reprojection
+from roel_service.geometry.se3 import SE3
+from roel_service.geometry.vectors import dot, norm
+from roel_service.mapping.frames import Frames
+from roel_service.mapping.front_end import Detected
+from roel_service.mapping.refine import (
+    DAMPING_AFTER_FAILURE,
+    DAMPING_AFTER_SUCCESS,
+    FIRST_DAMPING,
+    OrthonormalLines,
+    Refined,
+)
+from roel_service.mapping.views import Views, cuts_m, views_of
+from roel_service.scene.lines import InfiniteLines
+
+# Unknowns that are solved for at once: their normal equations take 512 MiB.
+MAX_UNKNOWN_COUNT = 8192
+# Steps that are tried, each damped more, before the present state counts as the best one.
+MAX_TRIAL_COUNT = 8
+# A step that lowers the cost by less than this share ends the iteration.
+CONVERGED_SHARE = 1e-6
+# Keeps the system regular along what nothing tells, as a share of its largest diagonal element.
+RIDGE_SHARE = 1e-14
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BatchRefined:
+    """Lines and poses after the batch.
+
+    Attributes:
+        lines: L lines, world.
+        T_world_camera: (N) poses of the frames.
+        costs: before the first step and after every one.
+        converged: the last step changed next to nothing.
+    """
+
+    lines: InfiniteLines
+    T_world_camera: SE3
+    costs: list[float]
+    converged: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _State:
+    lines: OrthonormalLines
+    poses: SE3
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Term:
+    """Residuals of S rows: values (S, k), by line (S, k, 4), by pose (S, k, 6), all weighted."""
+
+    residual: FloatArray
+    by_line: FloatArray
+    by_pose: FloatArray
+
+    def weighted(self, weight: FloatArray) -> _Term:
+        """With every row's squares times its (S,) weight."""
+        root = np.sqrt(weight)
+        return _Term(
+            residual=root[:, None] * self.residual,
+            by_line=root[:, None, None] * self.by_line,
+            by_pose=root[:, None, None] * self.by_pose,
+        )
+
+    def squared(self) -> _Term:
+        """One residual a row, the sum of the row's squares."""
+        twice = 2.0 * self.residual[:, None, :]
+        return _Term(
+            residual=dot(self.residual, self.residual)[:, None],
+            by_line=twice @ self.by_line,
+            by_pose=twice @ self.by_pose,
+        )
+
+
+def refine_batch(refined: Refined, detected: Detected, config: RefineConfig) -> BatchRefined:
+    """Refine all lines and the poses of all frames but the first.
+
+    Args:
+        refined: L first estimates with their tracks.
+        detected: the frames with their first poses, and what was seen.
+        config: residual (`grassmann` or `reprojection`), loss, weight of the event term and number
+            of steps.
+
+    Raises:
+        LimitError: RECORDING_TOO_LONG, more unknowns than `MAX_UNKNOWN_COUNT`.
+    """
+    unknown_count = 4 * len(refined) + 6 * (len(detected.frames) - 1)
+    if unknown_count > MAX_UNKNOWN_COUNT:
+        raise LimitError(
+            "lines and poses to refine at once",
+            f"at most {MAX_UNKNOWN_COUNT} unknowns",
+            f"{unknown_count}",
+            reason="RECORDING_TOO_LONG",
+        )
+    problem = _Problem(refined, detected, config)
+    state = problem.first_state(refined.lines, detected.frames.T_world_camera)
+    damping = FIRST_DAMPING
+    costs = [problem.cost(state)]
+    converged = False
+    for _ in range(config.pose_iteration_count):
+        terms = problem.terms(state)
+        weighted_cost = _cost(terms)
+        gradient, hessian = problem.normal_equations(terms)
+        for _ in range(MAX_TRIAL_COUNT):
+            trial = problem.step(state, gradient, hessian, damping)
+            cost = problem.cost(trial)
+            if cost <= costs[-1]:
+                break
+            damping *= DAMPING_AFTER_FAILURE
+        else:
+            converged = True
+            break
+        state = trial
+        damping *= DAMPING_AFTER_SUCCESS
+        costs.append(cost)
+        if costs[-2] - cost <= CONVERGED_SHARE * max(weighted_cost, cost):
+            converged = True
+            break
+    return BatchRefined(
+        lines=problem.world_lines(state),
+        T_world_camera=state.poses,
+        costs=costs,
+        converged=converged,
+    )
+
+
+class _Problem:
+    """The observations of all lines in one list, each row with its line and frame."""
+
+    def __init__(self, refined: Refined, detected: Detected, config: RefineConfig) -> None:
+        tracks, evidence = refined.tracks, detected.evidence
+        self.config = config
+        self.frames = detected.frames
+        self.observations = detected.observations
+        self.observation = tracks.observation
+        self.line = tracks.track_of_row
+        self.frame = detected.observations.frame[tracks.observation].astype(np.int64)
+        self.line_count = len(refined)
+        self.origin = refined.origin
+        self.length_px = evidence.views.length_px[tracks.observation]
+        events = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
+        self.event_weight = config.event_weight * events[tracks.observation]
+        self.root_forms = _roots(evidence.event_forms[tracks.observation][:, 3:, 3:])
+
+    def first_state(self, lines: InfiniteLines, poses: SE3) -> _State:
+        moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
+        U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
+        return _State(lines=OrthonormalLines(U=U, phi=phi), poses=poses)
+
+    def world_lines(self, state: _State) -> InfiniteLines:
+        direction, moment = state.lines.plucker
+        moment = plucker.shift_origin(direction, moment, -self.origin)
+        return InfiniteLines(direction=direction, moment=moment)
+
+    def cost(self, state: _State) -> float:
+        """Of all rows; of Cauchy's loss, its logarithms."""
+        if self.config.loss != "cauchy":
+            return _cost(self.terms(state))
+        scale = self.config.loss_scale_px
+        squares = (norm(self._line_term(state).residual) / scale) ** 2
+        cost = float(np.sum(self.length_px * scale**2 * np.log1p(squares)))
+        return cost + (_cost([self._event_term(state)]) if self.config.event_weight else 0.0)
+
+    def terms(self, state: _State) -> list[_Term]:
+        """Weighted residuals, with the weights of iterated reweighting where the loss has them."""
+        line_term = self._line_term(state)
+        if self.config.loss == "quartic":
+            line_term = line_term.squared()
+        weight = self.length_px
+        if self.config.loss == "cauchy":
+            scale = self.config.loss_scale_px
+            weight = weight / (1.0 + (norm(line_term.residual) / scale) ** 2)
+        terms = [line_term.weighted(weight)]
+        if self.config.event_weight:
+            terms.append(self._event_term(state))
+        return terms
+
+    def _line_term(self, state: _State) -> _Term:
+        """The residuals of the observed segments."""
+        U, phi = state.lines.U[self.line], state.lines.phi[self.line]
+        cameras = self._cameras(state)
+        if self.config.residual == "reprojection":
+            segments_px, K = self.observations.segments_px[self.observation], self.frames.K
+            by_line, by_pose = reprojection.end_line_jacobians(segments_px, cameras, U, phi, K)
+            v, m = plucker.plucker_from_orthonormal(U, phi)
+            distances_px = reprojection.end_line_distances_px(segments_px, cameras, v, m, K)
+            return _Term(residual=distances_px, by_line=by_line, by_pose=by_pose)
+        views = self._views(state)
+        v, m = plucker.plucker_from_orthonormal(U, phi)
+        along_m = self._middles_m(views, v, m)
+        foot = plucker.nearest_to_origin(v, m) + along_m[:, None] * v
+        by_line, by_pose = grassmann.plane_line_jacobians(
+            views.normal, views.centre, U, phi, along_m
+        )
+        return _Term(
+            residual=grassmann.plane_line_residual(views.normal, views.centre, v, foot),
+            by_line=by_line,
+            by_pose=by_pose,
+        )
+
+    def _event_term(self, state: _State) -> _Term:
+        """The weighted residuals of the events: a root of their form times m_c/|m_c|."""
+        U, phi = state.lines.U[self.line], state.lines.phi[self.line]
+        cameras = self._cameras(state)
+        direction, moment = plucker.plucker_from_orthonormal(U, phi)
+        moment = plucker.shift_origin(direction, moment, cameras.translation)
+        seen = np.einsum("sji,sj->si", cameras.rotation, moment)
+        size = norm(seen)[:, None]
+        unit = seen / size
+        turned = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / size[..., None]
+        by_line, by_pose = plucker.camera_moment_jacobians(cameras, U, phi)
+        chain = self.root_forms @ turned
+        term = _Term(
+            residual=(self.root_forms @ unit[..., None])[..., 0],
+            by_line=chain @ by_line,
+            by_pose=chain @ by_pose,
+        )
+        if self.config.loss == "quartic":
+            term = term.squared()
+        return term.weighted(self.event_weight)
+
+    def _cameras(self, state: _State) -> SE3:
+        """(S) T_world_camera about the origin of each row's line."""
+        poses = state.poses[self.frame]
+        return SE3(rotation=poses.rotation, translation=poses.translation - self.origin[self.line])
+
+    def _views(self, state: _State) -> Views:
+        """(S) as seen about the origin of each row's line."""
+        frames: Frames = replace(self.frames, T_world_camera=state.poses)
+        views = views_of(self.observations, frames).take(self.observation)
+        return replace(views, centre=views.centre - self.origin[self.line])
+
+    def _middles_m(self, views: Views, v: FloatArray, m: FloatArray) -> FloatArray:
+        """(S,) mean arc length of the middles of each line's observed intervals."""
+        middles = cuts_m(views, v, m)[0].mean(axis=-1)
+        known = np.isfinite(middles)
+        counts = np.bincount(self.line[known], minlength=self.line_count)
+        sums = np.bincount(self.line[known], middles[known], minlength=self.line_count)
+        return np.asarray((sums / np.maximum(counts, 1))[self.line])
+
+    def normal_equations(self, terms: Sequence[_Term]) -> tuple[FloatArray, FloatArray]:
+        """(U,) gradient and (U, U) Hessian; unknowns are lines, then all poses but the first."""
+        jacobian = sparse.vstack([self._jacobian(term) for term in terms], format="csr")
+        residual = np.concatenate([term.residual.ravel() for term in terms])
+        return jacobian.T @ residual, (jacobian.T @ jacobian).toarray()
+
+    def _jacobian(self, term: _Term) -> sparse.csr_array:
+        row_count, size = term.residual.shape
+        rows = np.arange(row_count * size).reshape(row_count, size, 1)
+        line_columns = 4 * self.line[:, None, None] + np.arange(4)
+        first_pose = 4 * self.line_count - 6
+        pose_columns = first_pose + 6 * self.frame[:, None, None] + np.arange(6)
+        # The first pose is held.
+        by_pose = np.where(self.frame[:, None, None] > 0, term.by_pose, 0.0)
+        pose_columns = np.maximum(pose_columns, 0)
+        shape = (row_count * size, 4 * self.line_count + 6 * (len(self.frames) - 1))
+        lines = _sparse(rows, line_columns, term.by_line, shape)
+        return lines + _sparse(rows, pose_columns, by_pose, shape)
+
+    def step(
+        self, state: _State, gradient: FloatArray, hessian: FloatArray, damping: float
+    ) -> _State:
+        """One damped step of everything."""
+        damped = hessian.copy()
+        diagonal = np.diagonal(hessian)
+        at = np.diag_indices_from(damped)
+        damped[at] += damping * diagonal + RIDGE_SHARE * diagonal.max()
+        delta = -linalg.solve(damped, gradient, assume_a="pos")
+        by_line = delta[: 4 * self.line_count].reshape(-1, 4)
+        by_pose = delta[4 * self.line_count :].reshape(-1, 6)
+        U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, by_line)
+        poses = state.poses.retract(np.concatenate([np.zeros((1, 6)), by_pose]))
+        return _State(lines=OrthonormalLines(U=U, phi=phi), poses=poses)
+
+
+def _cost(terms: Sequence[_Term]) -> float:
+    return float(sum(np.sum(term.residual**2) for term in terms))
+
+
+def _roots(forms: FloatArray) -> FloatArray:
+    """(S, 3, 3) matrices F with F^T F the given (S, 3, 3) forms."""
+    values, vectors = np.linalg.eigh(forms)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, :, None] * np.swapaxes(vectors, -1, -2))
+
+
+def _sparse(
+    rows: IntArray, columns: IntArray, values: FloatArray, shape: tuple[int, int]
+) -> sparse.csr_array:
+    """Values (S, k, D) at rows (S, k, 1) and columns (S, 1, D)."""
+    row, column = np.broadcast_arrays(rows, columns)
+    found = sparse.coo_array((values.ravel(), (row.ravel(), column.ravel())), shape)
+    return found.tocsr()
