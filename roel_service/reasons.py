@@ -107,6 +107,7 @@ _ROWS = (
         "serving another host than loopback without encryption or `--insecure`",
     ),
     Reason("TLS_INVALID", InputError, "files that are no certificate and its key"),
+    Reason("MANIFEST_INVALID", InputError, "a manifest of a batch that is no file of requests"),
     Reason("NO_ANSWER", NoAnswerError, "sound inputs with no answer in them"),
     Reason("DATA_UNSOUND", NoAnswerError, "a data folder in which a check found problems"),
     Reason(

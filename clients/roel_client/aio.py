@@ -9,12 +9,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import tempfile
 import uuid
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
+from google.protobuf.message import Message
 
 from roel_client.connection import AsyncConnection, AsyncExchange, Endpoint, Tls
 from roel_client.embedded import async_served
@@ -47,6 +49,7 @@ from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 from roel_service.wire import names
 from roel_service.wire.configs import config_to_proto
+from roel_service.wire.delimited import delimited, messages
 from roel_service.wire.errors import error_from_status
 from roel_service.wire.localization import localize_request, prior_to_proto
 from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
@@ -62,6 +65,24 @@ DEFAULT_RETRY = RetryPolicy()
 
 # The first answer waits for a child that starts, and for a cloud that is prepared.
 ANSWER_TIMEOUT_S = 120.0
+
+# What operations answer with, by their full names.
+ANSWERS = {
+    kind.DESCRIPTOR.full_name: kind
+    for kind in (
+        events_pb2.EventStream,
+        maps_pb2.MapVersion,
+        maps_pb2.RefinePosesResponse,
+        registration_pb2.BatchRegisterResponse,
+        localization_pb2.BatchLocalizeResponse,
+    )
+}
+BATCH_ITEMS = {
+    "BatchRegisterResponse": registration_pb2.BatchRegisterItem,
+    "BatchLocalizeResponse": localization_pb2.BatchLocalizeItem,
+}
+# No answer is larger than a message.
+MAX_ITEM_BYTES = 8 * 2**20
 
 # About 0.8 MiB a message.
 POSES_PER_MESSAGE = 8192
@@ -335,8 +356,53 @@ class AsyncClient:
             accepted = (await exchange.receive()).accepted
             yield AsyncPictureStream(exchange, accepted)
 
+    async def batch_register(
+        self, requests: Sequence[registration_pb2.RegisterRequest]
+    ) -> AsyncOperation:
+        """Begin many registrations, of which each has an answer or an error of its own.
+
+        Args:
+            requests: as `wire.registration.register_request` makes them.
+        """
+        manifest = await self._manifest(requests)
+        request = registration_pb2.BatchRegisterRequest(parent=names.PROJECT, manifest=manifest)
+        begun = await self._connection.call(self._registration.BatchRegister, request)
+        return self.operation(begun.name)
+
+    async def batch_localize(
+        self, requests: Sequence[localization_pb2.LocalizeRequest]
+    ) -> AsyncOperation:
+        """Begin to localize many pictures, of which each has an answer or an error of its own.
+
+        Args:
+            requests: as `wire.localization.localize_request` makes them, with their pictures.
+        """
+        manifest = await self._manifest(requests)
+        request = localization_pb2.BatchLocalizeRequest(parent=names.PROJECT, manifest=manifest)
+        begun = await self._connection.call(self._localization.BatchLocalize, request)
+        return self.operation(begun.name)
+
+    async def batch_items(
+        self,
+        answer: registration_pb2.BatchRegisterResponse | localization_pb2.BatchLocalizeResponse,
+    ) -> list[registration_pb2.BatchRegisterItem] | list[localization_pb2.BatchLocalizeItem]:
+        """The items of a batch that has ended, in the order of its requests."""
+        kind = BATCH_ITEMS[answer.DESCRIPTOR.name]
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "items")
+            await self.download_blob(answer.items.sha256, path)
+            with path.open("rb") as file:
+                return list(messages(file, kind, subject="items", max_bytes=MAX_ITEM_BYTES))
+
+    async def _manifest(self, requests: Sequence[Message]) -> types_pb2.BlobRef:
+        """The requests as a file that the server has."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "manifest")
+            path.write_bytes(b"".join(map(delimited, requests)))
+            return await self.upload_blob(path)
+
     def operation(self, name: str) -> AsyncOperation:
-        """A build that was begun before, perhaps by somebody else."""
+        """An operation that was begun before, perhaps by somebody else."""
         return AsyncOperation(self._connection, name)
 
     async def map_version(self, name: str) -> maps_pb2.MapVersion:
@@ -442,7 +508,7 @@ class AsyncPictureStream:
 
 
 class AsyncOperation:
-    """A build on a server.
+    """Work on a server.
 
     Attributes:
         name: `operations/{uuid}`.
@@ -455,11 +521,14 @@ class AsyncOperation:
         self._watching = roel_operations_pb2_grpc.OperationServiceStub(connection.channel)
         self._update_seq = 0
 
-    async def wait(self, progress: ProgressCallback = ignore) -> maps_pb2.MapVersion:
-        """The version that was built; whatever interrupts the waiting cancels the build.
+    async def wait(self, progress: ProgressCallback = ignore) -> Any:
+        """What the operation answers with; whatever interrupts the waiting cancels it.
+
+        Returns:
+            The `response_type` that the protocol names: of a build the version.
 
         Raises:
-            RoelError: why the build failed.
+            RoelError: why the operation failed.
             Cancelled: it was cancelled.
         """
         try:
@@ -470,9 +539,9 @@ class AsyncOperation:
             raise
         if operation.HasField("error"):
             raise error_from_status(operation.error)
-        version = maps_pb2.MapVersion()
-        operation.response.Unpack(version)
-        return version
+        answer = ANSWERS[operation.response.TypeName()]()
+        operation.response.Unpack(answer)
+        return answer
 
     async def is_done(self) -> bool:
         """Whether the operation has ended, well or not."""
@@ -480,7 +549,7 @@ class AsyncOperation:
         return bool((await self._connection.call(self._operations.GetOperation, request)).done)
 
     async def cancel(self) -> None:
-        """End the build; returns when it has ended."""
+        """End the work; returns when it has ended."""
         request = operations_pb2.CancelOperationRequest(name=self.name)
         await self._connection.call(self._operations.CancelOperation, request)
 

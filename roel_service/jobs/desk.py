@@ -18,9 +18,10 @@ class Desk:
 
     def __call__(self, question: Question, tell: Tell) -> bytes:
         """The serialized answer."""
-        return bytes(self._answer(question).SerializeToString())
+        return bytes(self.answer(question).SerializeToString())
 
-    def _answer(self, question: Question) -> Any:
+    def answer(self, question: Question) -> Any:
+        """The answer, as a message."""
         if isinstance(question, RegisterQuestion):
             return registration.answer(question, self._preparations)
         return localization.answer(question, self._preparations)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from roel_service.config.stages import Config
+from roel_service.jobs.batch_inputs import BatchParameters
 from roel_service.jobs.event_imports import EventImportParameters
 from roel_service.jobs.imports import ImportParameters
 from roel_service.jobs.inputs import (
@@ -24,12 +25,12 @@ class Prepared(NamedTuple):
     """Work for an executor.
 
     Attributes:
-        waits_s: so long the work may wait for somebody else; its time limit grows by it.
+        extra_s: so much longer than others the work may take.
     """
 
     entrypoint: str
     parameters: Any
-    waits_s: float = 0.0
+    extra_s: float = 0.0
 
 
 def cache_place(store: Store, max_bytes: int) -> CachePlace | None:
@@ -77,6 +78,39 @@ def event_import_preparation(store: Store, max_size_bytes: int) -> Prepare:
     return prepare
 
 
+def batch_preparation(
+    store: Store,
+    entrypoint: str,
+    *,
+    cache_bytes: int,
+    inline_point_count: int,
+    max_item_bytes: int,
+    item_time_s: float,
+) -> Prepare:
+    """How a batch is prepared: its task names the manifest, and how many requests that has.
+
+    Args:
+        max_item_bytes: of one request.
+        item_time_s: what one request may add to the time of the work.
+    """
+
+    def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
+        item_count = int(task.parameters)
+        parameters = BatchParameters(
+            folder=store.folder,
+            manifest=store.batches.blob_path(task.inputs[0]),
+            item_count=item_count,
+            max_item_bytes=max_item_bytes,
+            journal=store.batches.journal(task),
+            earlier_journals=store.batches.earlier_journals(task),
+            cache=cache_place(store, cache_bytes),
+            inline_point_count=inline_point_count,
+        )
+        return Prepared(entrypoint, parameters, extra_s=item_count * item_time_s)
+
+    return prepare
+
+
 def build_preparation(
     store: Store, entrypoint: str, *, cache_bytes: int, patience_s: float
 ) -> Prepare:
@@ -102,6 +136,6 @@ def build_preparation(
             patience_s=patience_s,
             cache=cache,
         )
-        return Prepared(entrypoint, followed, waits_s=LONGEST_UPLOAD_S)
+        return Prepared(entrypoint, followed, extra_s=LONGEST_UPLOAD_S)
 
     return prepare

@@ -8,7 +8,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from roel_service.jobs.inputs import CachePlace
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
 from roel_service.scene.lines import LineMap
 from roel_service.store.maps import Maps
+from roel_service.store.store import maps_of
 from roel_service.v1 import config_pb2, localization_pb2, registration_pb2, types_pb2
 from roel_service.wire import names
 from roel_service.wire.configs import config_from_proto
@@ -213,6 +215,20 @@ class Questions:
     def _blob(self, message: types_pb2.BlobRef, name: str) -> StoredFile:
         sha256 = names.checked_sha256(message.sha256)
         return StoredFile(name=name, path=self._blob_path(sha256), sha256=sha256)
+
+
+@contextmanager
+def questions_of(
+    folder: Path, cache: CachePlace | None, inline_point_count: int
+) -> Iterator[Questions]:
+    """Makes questions beside the server that has the folder; arguments as of `Questions`."""
+    with maps_of(folder) as (maps, blobs):
+
+        def blob_path(sha256: str) -> Path:
+            blobs.require(sha256)
+            return blobs.path(sha256)
+
+        yield Questions(maps, blob_path, cache, inline_point_count)
 
 
 def _check_digest(file: StoredFile, found: str) -> None:

@@ -60,10 +60,10 @@ class Policy:
     time_s: float = 3600.0
     retry_delay_s: float = 1.0
 
-    def limits(self, task: TaskRecord, waits_s: float) -> Limits:
-        """Those of the next attempt, which may wait for somebody else."""
+    def limits(self, task: TaskRecord, extra_s: float) -> Limits:
+        """Those of the next attempt, which may take longer than others by so much."""
         memory_bytes = min(self.memory_bytes << task.memory_doublings, self.max_memory_bytes)
-        return Limits(memory_bytes=memory_bytes, time_s=self.time_s + waits_s)
+        return Limits(memory_bytes=memory_bytes, time_s=self.time_s + extra_s)
 
     @property
     def max_memory_doublings(self) -> int:
@@ -232,7 +232,7 @@ class Scheduler:
         operation = await asyncio.to_thread(self._operations.get, task.operation_id)
         prepare = self._prepare[operation.method]
         work = await asyncio.to_thread(prepare, operation, task)
-        limits = self._policy.limits(task, work.waits_s)
+        limits = self._policy.limits(task, work.extra_s)
         spec = TaskSpec(entrypoint=work.entrypoint, parameters=work.parameters, limits=limits)
         return await self._executor.run(spec, lambda news: self._hear(task, metadata, news))
 

@@ -7,9 +7,12 @@ import dataclasses
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
+from google.longrunning import operations_pb2
+
 from roel_service.errors import InputError, LimitError, RoelError
 from roel_service.jobs.questions import LocalizeQuestion, Questions, pose_prior
 from roel_service.service.asking import Asking
+from roel_service.service.batches import Batching
 from roel_service.service.settings import Settings
 from roel_service.service.uploads import request_part
 from roel_service.v1 import localization_pb2
@@ -19,9 +22,12 @@ from roel_service.wire.errors import status_from_error
 class LocalizationServicer:
     """Makes questions of requests, and has them answered."""
 
-    def __init__(self, questions: Questions, asking: Asking, settings: Settings) -> None:
+    def __init__(
+        self, questions: Questions, asking: Asking, batching: Batching, settings: Settings
+    ) -> None:
         self._questions = questions
         self._asking = asking
+        self._batching = batching
         self._settings = settings
 
     async def Localize(
@@ -43,6 +49,11 @@ class LocalizationServicer:
         pictures = PictureStream(requests, credit, lambda picture: self._located(search, picture))
         async for answer in pictures.answers():
             yield answer
+
+    async def BatchLocalize(
+        self, request: localization_pb2.BatchLocalizeRequest, context: Any
+    ) -> operations_pb2.Operation:
+        return await self._batching.begin(request)
 
     async def _setup(
         self, requests: AsyncIterator[localization_pb2.StreamLocalizeRequest]

@@ -14,6 +14,8 @@ from roel_service.errors import NotFoundError
 from roel_service.jobs.scheduler import Begin, Scheduler
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import (
+    BATCH_ANSWERS,
+    batch_answer,
     event_stream_to_proto,
     map_version_to_proto,
     operation_to_proto,
@@ -130,5 +132,7 @@ def _answer(store: Store, record: OperationRecord) -> Any:
     with contextlib.suppress(NotFoundError):
         if record.method is OperationMethod.IMPORT_EVENT_STREAM:
             return event_stream_to_proto(store.event_streams.get(record.event_stream_id))
+        if record.method in BATCH_ANSWERS:
+            return batch_answer(record)
         return map_version_to_proto(store.maps.made_version(record))
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,14 @@ from roel_service.store.records import (
     StreamState,
     VersionState,
 )
-from roel_service.v1 import events_pb2, map_file_pb2, maps_pb2, types_pb2
+from roel_service.v1 import (
+    events_pb2,
+    localization_pb2,
+    map_file_pb2,
+    maps_pb2,
+    registration_pb2,
+    types_pb2,
+)
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.wire import names
 from roel_service.wire.errors import status_from_error
@@ -114,6 +122,22 @@ def _imported_file(imported: dict[str, Any]) -> maps_pb2.ImportedFile:
     )
 
 
+BATCH_ANSWERS: dict[OperationMethod, Any] = {
+    OperationMethod.BATCH_REGISTER: registration_pb2.BatchRegisterResponse,
+    OperationMethod.BATCH_LOCALIZE: localization_pb2.BatchLocalizeResponse,
+}
+
+
+def batch_answer(record: OperationRecord) -> Any:
+    """What a batch that SUCCEEDED answers with."""
+    result = json.loads(record.result)
+    return BATCH_ANSWERS[record.method](
+        items=types_pb2.BlobRef(sha256=result["sha256"], size_bytes=result["size_bytes"]),
+        item_count=result["item_count"],
+        failed_count=result["failed_count"],
+    )
+
+
 def operation_to_proto(record: OperationRecord, answer: Message | None) -> operations_pb2.Operation:
     """An operation; `answer` is that of one that SUCCEEDED."""
     operation = operations_pb2.Operation(
@@ -151,11 +175,17 @@ def _stream_name(record: OperationRecord) -> str:
     return names.event_stream_name(record.event_stream_id)
 
 
-# The resource that each method makes.
+def _project(record: OperationRecord) -> str:
+    return names.PROJECT
+
+
+# The resource that each method makes, or works for.
 _TARGETS: dict[OperationMethod, Callable[[OperationRecord], str]] = {
     OperationMethod.BUILD_MAP: _version_name,
     OperationMethod.IMPORT_MAP: _version_name,
     OperationMethod.IMPORT_EVENT_STREAM: _stream_name,
+    OperationMethod.BATCH_REGISTER: _project,
+    OperationMethod.BATCH_LOCALIZE: _project,
 }
 
 

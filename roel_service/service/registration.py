@@ -5,17 +5,21 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+from google.longrunning import operations_pb2
+
 from roel_service.jobs.questions import Questions
 from roel_service.service.asking import Asking
+from roel_service.service.batches import Batching
 from roel_service.v1 import registration_pb2
 
 
 class RegistrationServicer:
     """Makes questions of requests, and has them answered."""
 
-    def __init__(self, questions: Questions, asking: Asking) -> None:
+    def __init__(self, questions: Questions, asking: Asking, batching: Batching) -> None:
         self._questions = questions
         self._asking = asking
+        self._batching = batching
 
     async def Register(
         self, request: registration_pb2.RegisterRequest, context: Any
@@ -23,3 +27,8 @@ class RegistrationServicer:
         question = await asyncio.to_thread(self._questions.registration, request)
         answer = await self._asking.answer(question)
         return registration_pb2.RegisterResponse.FromString(answer)
+
+    async def BatchRegister(
+        self, request: registration_pb2.BatchRegisterRequest, context: Any
+    ) -> operations_pb2.Operation:
+        return await self._batching.begin(request)

@@ -18,6 +18,7 @@ from grpc_reflection.v1alpha import reflection
 
 from roel_service.jobs.executors import ProcessExecutor
 from roel_service.jobs.preparation import (
+    batch_preparation,
     build_preparation,
     event_import_preparation,
     import_preparation,
@@ -55,6 +56,9 @@ STOP_GRACE_S = 1.0
 IDENTITY_ONLY = 1
 
 DEFAULT_SETTINGS = Settings()
+
+BATCH_REGISTER = "roel_service.jobs.batches:run_batch_register"
+BATCH_LOCALIZE = "roel_service.jobs.batches:run_batch_localize"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +145,14 @@ async def running(
 
 
 def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
+    batch = partial(
+        batch_preparation,
+        store,
+        cache_bytes=settings.stage_cache_bytes,
+        inline_point_count=settings.inline_point_count,
+        max_item_bytes=settings.message_in_bytes,
+        item_time_s=settings.batch_item_time_s,
+    )
     build = build_preparation(
         store,
         settings.build_entrypoint,
@@ -157,6 +169,8 @@ def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
             OperationMethod.IMPORT_EVENT_STREAM: event_import_preparation(
                 store, settings.event_stream_bytes
             ),
+            OperationMethod.BATCH_REGISTER: batch(BATCH_REGISTER),
+            OperationMethod.BATCH_LOCALIZE: batch(BATCH_LOCALIZE),
         },
         Policy(
             unfinished_count=settings.concurrent_builds + settings.queued_builds,

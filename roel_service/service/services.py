@@ -10,6 +10,7 @@ from roel_service.jobs.preparation import cache_place
 from roel_service.jobs.questions import Questions
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.asking import Asking
+from roel_service.service.batches import Batching
 from roel_service.service.blobs import BlobServicer
 from roel_service.service.capabilities import CapabilitiesServicer
 from roel_service.service.event_streams import EventStreamServicer
@@ -21,6 +22,7 @@ from roel_service.service.operations import OperationServicer
 from roel_service.service.registration import RegistrationServicer
 from roel_service.service.settings import Settings
 from roel_service.service.uploads import OpenUploads
+from roel_service.store.records import OperationMethod
 from roel_service.store.store import Store
 from roel_service.v1 import (
     blobs_pb2,
@@ -89,14 +91,30 @@ def add_services(
         cache_place(store, settings.stage_cache_bytes),
         settings.inline_point_count,
     )
+    registrations = Batching(
+        store,
+        scheduler,
+        settings,
+        OperationMethod.BATCH_REGISTER,
+        registration_pb2.RegisterRequest,
+        "cloud",
+    )
+    localizations = Batching(
+        store,
+        scheduler,
+        settings,
+        OperationMethod.BATCH_LOCALIZE,
+        localization_pb2.LocalizeRequest,
+        "image_blob",
+    )
     operations = OperationServicer(store, scheduler)
     uploads = OpenUploads(settings.open_uploads)
     servicers: dict[str, object] = {
         "EventStreamService": EventStreamServicer(store, scheduler, uploads, settings),
         "BlobService": BlobServicer(store.uploads, uploads, settings),
         "MapService": MapServicer(store, scheduler, exporter, settings),
-        "RegistrationService": RegistrationServicer(questions, asking),
-        "LocalizationService": LocalizationServicer(questions, asking, settings),
+        "RegistrationService": RegistrationServicer(questions, asking, registrations),
+        "LocalizationService": LocalizationServicer(questions, asking, localizations, settings),
         "OperationService": operations,
         "Operations": operations,
     }

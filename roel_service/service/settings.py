@@ -53,6 +53,8 @@ class Settings:
         interactive_time_s: how long an answer may take.
         open_streams: streams of pictures or events that are located at a time.
         stream_credit_pictures: pictures of a stream that may be unanswered.
+        batch_item_count: most requests of a batch.
+        batch_item_time_s: what a request may add to the time of its batch.
         inline_point_count: most points of a cloud that comes in a request.
         export_time_s: how long a version may take to be written in another format.
         concurrent_exports, queued_exports: such versions at a time, and those that may wait.
@@ -93,6 +95,8 @@ class Settings:
     interactive_workers: int = 2
     interactive_queued: int = 8
     interactive_time_s: float = 120.0
+    batch_item_count: int = 100_000
+    batch_item_time_s: float = 10.0
     inline_point_count: int = 250_000
     open_streams: int = 32
     stream_credit_pictures: int = 4

@@ -48,6 +48,9 @@ class OperationMethod(Enum):
     BUILD_MAP = "BuildMap"
     IMPORT_MAP = "ImportMap"
     IMPORT_EVENT_STREAM = "ImportEventStream"
+    REFINE_POSES = "RefinePoses"
+    BATCH_REGISTER = "BatchRegister"
+    BATCH_LOCALIZE = "BatchLocalize"
 
 
 class OperationState(Enum):
@@ -143,6 +146,7 @@ class MapVersionRecord:
         imported_file: what it was read from; empty if it was built.
         provenance: what the map was made of.
         purge_time_us: when a deleted version will be forgotten; 0 for any other.
+        trajectory_sha256, trajectory_bytes: its poses, if they were refined with its lines.
     """
 
     map_id: str
@@ -159,6 +163,8 @@ class MapVersionRecord:
     imported_file: dict[str, Any] = dataclasses.field(default_factory=dict)
     provenance: dict[str, str] = dataclasses.field(default_factory=dict)
     purge_time_us: int = 0
+    trajectory_sha256: str = ""
+    trajectory_bytes: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +179,7 @@ class OperationRecord:
         error: what went wrong in the same way; empty unless FAILED.
         update_seq: grows with every change.
         end_time_us, expire_time_us: 0 until it is final.
+        result_sha256: file that belongs to the answer; empty if there is none.
     """
 
     id: str
@@ -193,6 +200,7 @@ class OperationRecord:
     create_time_us: int
     end_time_us: int
     expire_time_us: int
+    result_sha256: str = ""
 
 
 class TaskState(Enum):

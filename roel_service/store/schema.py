@@ -103,6 +103,8 @@ MAP_VERSION = Table(
     Column("imported_file", String, nullable=False),
     Column("provenance", String, nullable=False),
     Column("purge_time_us", BigInteger, nullable=False),
+    Column("trajectory_sha256", String, nullable=False),
+    Column("trajectory_bytes", BigInteger, nullable=False),
 )
 
 OPERATION = Table(
@@ -126,6 +128,7 @@ OPERATION = Table(
     Column("create_time_us", BigInteger, nullable=False),
     Column("end_time_us", BigInteger, nullable=False),
     Column("expire_time_us", BigInteger, nullable=False),
+    Column("result_sha256", String, nullable=False),
 )
 
 TASK = Table(

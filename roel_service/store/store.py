@@ -14,6 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from roel_service.errors import InputError, StateError
 from roel_service.store.audit import Audit
+from roel_service.store.batches import BatchCompletion, Batches
 from roel_service.store.blobs import BlobStore
 from roel_service.store.builds import Builds, VersionCompletion
 from roel_service.store.database import Database
@@ -45,7 +46,8 @@ class Store:
 
     Attributes:
         folder: where it is.
-        event_streams, event_imports, uploads, maps, builds, operations, tasks: the repositories.
+        event_streams, event_imports, uploads, maps, builds, batches, operations, tasks: the
+            repositories.
         principals, audit: who may call, and who changed what.
 
     Raises:
@@ -69,13 +71,16 @@ class Store:
             self.builds = Builds(self._database, self._blobs)
             self.principals = Principals(self._database)
             self.audit = Audit(self._database, AUDIT_ROW_COUNT)
-            versions = VersionCompletion(self._blobs)
+            self.batches = Batches(self._database, self._blobs, folder / "batches")
+            versions, batches = VersionCompletion(self._blobs), BatchCompletion(self._blobs)
             self.operations = Operations(
                 self._database,
                 {
                     OperationMethod.BUILD_MAP: versions,
                     OperationMethod.IMPORT_MAP: versions,
                     OperationMethod.IMPORT_EVENT_STREAM: EventImportCompletion(self._recordings),
+                    OperationMethod.BATCH_REGISTER: batches,
+                    OperationMethod.BATCH_LOCALIZE: batches,
                 },
             )
             self.tasks = Tasks(self._database)
@@ -83,6 +88,7 @@ class Store:
             # What a crash left of uploads; nothing is being written yet.
             self.event_streams.recover()
             self.uploads.recover()
+            self.batches.delete_ended()
             self._scratch = _emptied(folder / "scratch")
             self._blobs.recover()
             self._resources = resources.pop_all()
@@ -98,6 +104,7 @@ class Store:
         self.operations.delete_expired()
         self.maps.forget_deleted()
         self.uploads.delete_expired()
+        self.batches.delete_ended()
         with self._database.write() as connection:
             delete_expired_requests(connection)
         return sweep_blobs(self._database, self._blobs, unused_for_s)
@@ -150,6 +157,17 @@ def recordings_of(folder: Path) -> Iterator[EventStreams]:
     try:
         blobs = BlobStore(folder / BLOBS)
         yield EventStreams(database, blobs, Recordings(folder / RECORDINGS))
+    finally:
+        database.close()
+
+
+@contextmanager
+def maps_of(folder: Path) -> Iterator[tuple[Maps, BlobStore]]:
+    """The maps and blobs of a folder that a server has open; to be read, not to be changed."""
+    database = Database(folder / ROWS)
+    try:
+        blobs = BlobStore(folder / BLOBS)
+        yield Maps(database, blobs), blobs
     finally:
         database.close()
 

@@ -108,6 +108,11 @@ def checked_sha256(value: str) -> str:
     return value
 
 
+def is_sha256(value: str) -> bool:
+    """Whether this is a digest."""
+    return _SHA256.fullmatch(value) is not None
+
+
 def operation_name(operation_id: str) -> str:
     """The name of an operation."""
     return f"operations/{operation_id}"

@@ -326,5 +326,5 @@ def test_time_to_wait_is_added_to_the_limit():
         lease_until_us=0,
         fence=1,
     )
-    limits = policy.limits(task, waits_s=5.0)
+    limits = policy.limits(task, extra_s=5.0)
     assert (limits.time_s, limits.memory_bytes) == (15.0, policy.max_memory_bytes)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import json
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from roel_client.cli.register import register
 from roel_client.connection import Connection, Endpoint
 from roel_service.config.stages import LocalizeConfig, RegisterConfig
 from roel_service.errors import (
+    Cancelled,
     CloudError,
     ConfigError,
     InputError,
@@ -27,6 +29,8 @@ from roel_service.errors import (
 from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.io.clouds import write_npz
 from roel_service.io.images import decode_panorama
+from roel_service.jobs.batch_inputs import BatchParameters
+from roel_service.jobs.batches import run_batch_localize
 from roel_service.pano_loc.localize import localize_panorama
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.register.register import register_map
@@ -42,10 +46,11 @@ from roel_service.v1 import (
     registration_pb2_grpc,
     types_pb2,
 )
+from roel_service.wire.delimited import delimited
 from roel_service.wire.errors import error_from_status
-from roel_service.wire.localization import localization_from_proto
+from roel_service.wire.localization import localization_from_proto, localize_request
 from roel_service.wire.provenance import Provenance
-from roel_service.wire.registration import registration_from_proto
+from roel_service.wire.registration import register_request, registration_from_proto
 from roel_service.wire.rlm import decode_map, encode_map
 
 from ..pano_loc.rooms import OTHER_FURNITURE, OTHER_ROOM, map_of, pose, segments_of
@@ -364,6 +369,100 @@ class TestStream:
             list(connection.stream(stub.StreamLocalize, iter(messages)))
 
 
+@pytest.fixture(scope="module")
+def requests(places, picture):
+    """A picture that is found, one that is none, and one of a map that is not there."""
+    asked = []
+    for name, image in ((places[0], picture), (places[0], b"no picture"), (NOWHERE, picture)):
+        request = localize_request([name], T_prior=TRUTH, config=FAST)
+        request.image = image
+        asked.append(request)
+    return asked
+
+
+class TestBatch:
+    def test_every_request_has_its_answer_or_its_error(self, client, requests, places):
+        answer = client.batch_localize(requests).wait()
+        assert (answer.item_count, answer.failed_count) == (3, 2)
+        found, *failed = client.batch_items(answer)
+        assert (found.index, found.response.status) == (0, FOUND)
+        assert found.response.map_versions == places[:1]
+        reasons = [error_from_status(item.error).reason for item in failed]
+        assert reasons == ["PANORAMA_INVALID", "NOT_FOUND"]
+
+    def test_registrations_are_batched_alike(self, connection, client, version, cloud):
+        stub = registration_pb2_grpc.RegistrationServiceStub(connection.channel)
+        request = registration_pb2.BatchRegisterRequest(
+            parent="projects/default", requests=[register_request(version, cloud, config=COARSE)]
+        )
+        operation = client.operation(connection.call(stub.BatchRegister, request).name)
+        (item,) = client.batch_items(operation.wait())
+        assert item.response.map_version == version
+        again = connection.call(stub.BatchRegister, request)
+        assert again.name == operation.name
+
+    @pytest.mark.parametrize(
+        ("fields", "error", "message"),
+        [
+            ({}, InputError, "requests: expected requests or a manifest, found both or none"),
+            ({"parent": "projects/other"}, NotFoundError, "parent"),
+            ({"manifest": types_pb2.BlobRef(sha256="0" * 64)}, NotFoundError, "blob"),
+        ],
+    )
+    def test_batches_that_cannot_begin_are_refused(self, connection, fields, error, message):
+        stub = localization_pb2_grpc.LocalizationServiceStub(connection.channel)
+        request = localization_pb2.BatchLocalizeRequest(**{"parent": "projects/default", **fields})
+        with pytest.raises(error, match=message):
+            connection.call(stub.BatchLocalize, request)
+
+    def test_a_manifest_that_is_none_is_refused(self, client, connection, tmp_path):
+        (tmp_path / "manifest").write_bytes(b"\x07short")
+        blob = client.upload_blob(tmp_path / "manifest")
+        stub = localization_pb2_grpc.LocalizationServiceStub(connection.channel)
+        request = localization_pb2.BatchLocalizeRequest(parent="projects/default", manifest=blob)
+        with pytest.raises(InputError, match="expected 7 bytes, found 5 at message 0") as caught:
+            connection.call(stub.BatchLocalize, request)
+        assert caught.value.reason == "MANIFEST_INVALID"
+
+    def test_an_attempt_goes_on_where_the_best_one_before_it_ended(self, data, requests, tmp_path):
+        manifest = tmp_path / "manifest"
+        manifest.write_bytes(b"".join(map(delimited, requests)))
+
+        def attempt(name, earlier=(), end_at=9):
+            parameters = BatchParameters(
+                folder=data,
+                manifest=manifest,
+                item_count=3,
+                max_item_bytes=2**22,
+                journal=tmp_path / name,
+                earlier_journals=[tmp_path / path for path in earlier],
+                cache=None,
+                inline_point_count=0,
+            )
+            told = []
+
+            def tell(progress):
+                told.append((progress.done_count, progress.cached_count))
+                if progress.done_count == end_at:
+                    raise Cancelled
+
+            return run_batch_localize(parameters, tell), told
+
+        whole, told = attempt("whole")
+        assert told == [(0, 0), (1, 0), (2, 0)]
+        with pytest.raises(Cancelled):
+            attempt("first", end_at=2)
+        # The last item was being written.
+        torn = (tmp_path / "first").read_bytes()
+        (tmp_path / "torn").write_bytes(torn[:-3])
+        resumed, told = attempt("second", ["torn"])
+        assert told == [(1, 1), (2, 1)]
+        resumed, told = attempt("third", ["torn", "first"])
+        assert told == [(2, 2)]
+        assert (resumed.item_count, resumed.failed_count) == (3, whole.failed_count)
+        assert (tmp_path / "third").read_bytes().startswith(torn)
+
+
 @pytest.mark.parametrize("command", [register, localize])
 def test_the_command_asks_a_server(server, tokens, folder, monkeypatch, capsys, command):
     monkeypatch.chdir(folder)
@@ -376,3 +475,33 @@ def test_the_command_asks_a_server(server, tokens, folder, monkeypatch, capsys, 
         command(parser().parse_args([*line, *more]), {})
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1] != ""
+
+
+def test_a_batch_of_files_has_the_same_rows_here_and_on_a_server(
+    server, tokens, folder, capsys, monkeypatch
+):
+    monkeypatch.setenv("ROEL_TOKEN", tokens[Role.ADMIN])
+    (folder / "manifest.txt").write_text("room.png\nT.txt\n")
+    rows = []
+    for more in ([], ["--server", server.address]):
+        out = folder / f"rows-{len(more)}.jsonl"
+        line = ["batch", "localize", folder / "manifest.txt", "--maps", folder / "map.rlm"]
+        line += [
+            "--out",
+            out,
+            "--config",
+            folder / "coarse.toml",
+            "--workers",
+            "1",
+            "--json",
+            *more,
+        ]
+        options = parser().parse_args(list(map(str, line)))
+        options.command.run(options, {})
+        assert json.loads(capsys.readouterr().out)["failed_count"] == 1
+        rows.append([json.loads(text) for text in out.read_text().splitlines()])
+        assert not out.with_name(f"{out.name}.partial").exists()
+    for row in (*rows[0], *rows[1]):
+        row["seconds"] = None
+    assert rows[0] == rows[1]
+    assert [row["reason"] for row in rows[0]][1] == "PANORAMA_INVALID"

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 
 from roel_client.cli import (
     admin,
+    batch,
     bench,
     configuration,
     demo,
@@ -145,6 +146,7 @@ def parser() -> Parser:
         maps,
         register,
         localize,
+        batch,
         poses,
         evaluate,
         simulate,

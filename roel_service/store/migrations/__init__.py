@@ -18,6 +18,7 @@ from roel_service.store.migrations import (
     m005_writers_of_recordings,
     m006_uploads,
     m007_principals,
+    m008_results,
 )
 
 # Step k leads from version k to k + 1.
@@ -29,6 +30,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m005_writers_of_recordings.migrate,
     m006_uploads.migrate,
     m007_principals.migrate,
+    m008_results.migrate,
 )
 
 
