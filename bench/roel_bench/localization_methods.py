@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
+from roel_service.pano_loc.fgpl.localize import localize_fgpl, prepare_fgpl
+from roel_service.pano_loc.fgpl.parameters import VARIANTS, FgplParameters
 from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.localize import localize_panorama
 from roel_service.pano_loc.prepare import prepare_map
@@ -77,4 +80,17 @@ def _prepare_default(line_map: LineMap) -> Query:
     return query
 
 
-METHODS = {method.name: method for method in (Method(name="default", prepare=_prepare_default),)}
+def _prepare_fgpl(line_map: LineMap, *, parameters: FgplParameters) -> Query:
+    prepared = prepare_fgpl(line_map, parameters, np.random.default_rng(0))
+
+    def query(grey: Array, prior: SE3 | None) -> Answer:
+        found = localize_fgpl(grey, [prepared], parameters)
+        return Answer(status="", poses=() if found is None else (found.T_world_panorama,))
+
+    return query
+
+
+METHODS = {"default": Method(name="default", prepare=_prepare_default)} | {
+    name: Method(name=name, prepare=partial(_prepare_fgpl, parameters=parameters))
+    for name, parameters in VARIANTS.items()
+}
