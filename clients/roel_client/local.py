@@ -23,7 +23,9 @@ from roel_service.wire.names import is_resource_name
 if TYPE_CHECKING:
     from roel_client.batch import Locate, Located, Query
     from roel_client.client import Client
+    from roel_service.arrays import Array
     from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
+    from roel_service.geometry.se3 import SE3
     from roel_service.io.events import EventFile
     from roel_service.progress import ProgressCallback
     from roel_service.scene.camera import Camera
@@ -362,6 +364,7 @@ def localize_panoramas(
     names: list[str],
     panorama_names: list[str],
     *,
+    method: str,
     prior: str | None,
     config: LocalizeConfig,
     overlay: Path | None,
@@ -373,31 +376,50 @@ def localize_panoramas(
     Args:
         names: of the maps.
         panorama_names: files.
-        prior: file with the first T_world_panorama.
-        config: parameters.
+        method: `default`, `fgpl` or `fgpl-released`.
+        prior: file with the first T_world_panorama, for the default alone.
+        config: parameters of the default, and of the verdict.
         overlay: folder to make, for one picture each.
     """
     from roel_service.io.images import read_panorama
     from roel_service.io.transforms import read_transform
-    from roel_service.pano_loc.hints import PosePrior
-    from roel_service.pano_loc.localize import localize_panorama
-    from roel_service.pano_loc.prepare import prepare_map
 
     line_maps = [_read_map(name) for name in names]
-    first = None if prior is None else PosePrior(T_world_picture=read_transform(Path(prior)))
+    T_prior = None if prior is None else read_transform(Path(prior))
     for panorama_name in panorama_names:
         read_panorama(Path(panorama_name))
-    maps = [prepare_map(line_map, config) for line_map in line_maps]
+    locate = _locator(method, line_maps, T_prior, config)
     if overlay is not None:
         overlay.mkdir()
     for index, panorama_name in enumerate(panorama_names):
         grey = read_panorama(Path(panorama_name))
         started_s = time.perf_counter()
-        result = localize_panorama(grey, maps, config, prior=first)
+        result = locate(grey)
         seconds = time.perf_counter() - started_s
         if overlay is not None:
             _draw_overlay(overlay, index, panorama_name, line_maps, result)
         yield _localization_document(panorama_name, names, result, seconds)
+
+
+def _locator(
+    method: str, line_maps: list[LineMap], T_prior: SE3 | None, config: LocalizeConfig
+) -> Callable[[Array], PanoLocResult]:
+    """Prepare maps, and return what locates a grey panorama in them."""
+    if method == "default":
+        from roel_service.pano_loc.hints import PosePrior
+        from roel_service.pano_loc.localize import localize_panorama
+        from roel_service.pano_loc.prepare import prepare_map
+
+        prior = None if T_prior is None else PosePrior(T_world_picture=T_prior)
+        maps = [prepare_map(line_map, config) for line_map in line_maps]
+        return lambda grey: localize_panorama(grey, maps, config, prior=prior)
+
+    from roel_service.pano_loc.fgpl.parameters import VARIANTS
+    from roel_service.pano_loc.fgpl.verdict import localize_judged, prepare_judged
+
+    parameters = VARIANTS[method]
+    judged = [prepare_judged(line_map, parameters, config) for line_map in line_maps]
+    return lambda grey: localize_judged(grey, judged, parameters, config)
 
 
 def localize_panoramas_remotely(

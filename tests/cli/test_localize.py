@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from roel_client.cli.localize import localize
+from roel_client import local
+from roel_client.cli.localize import METHODS, localize
 from roel_client.cli.main import parser
+from roel_service.config.stages import LocalizeConfig
 from roel_service.errors import NoAnswerError
 from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
 from roel_service.geometry.se3 import SE3
@@ -70,7 +72,10 @@ def test_one_line_of_json_a_panorama_and_one_picture(folder):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["room.png", "--preset", "paper"], "roel: error: --preset: expected default, the one"),
+        (
+            ["room.png", "--preset", "paper", "--prior", "T.txt"],
+            "roel: error: --preset: expected default, as there is --prior, found paper",
+        ),
         (
             ["room.png", "square.png"],
             "roel: error: square.png: expected a width of twice the height",
@@ -85,6 +90,20 @@ def test_unusable_inputs_end_with_2_and_one_line(folder, arguments, message):
     assert (done.returncode, done.stdout) == (2, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(message)
+
+
+@pytest.mark.parametrize("preset", ["paper", "fgpl-released"])
+def test_fgpl_gets_the_same_keys_and_a_verdict(folder, preset):
+    (document,) = local.localize_panoramas(
+        [str(folder / "map.npz")],
+        [str(folder / "black.jpg")],
+        method=METHODS[preset],
+        prior=None,
+        config=LocalizeConfig(),
+        overlay=None,
+    )
+    assert set(document) == KEYS
+    assert (document["status"], document["reason"]) == ("NOT_FOUND", "INSUFFICIENT_LINES")
 
 
 def test_strict_says_which_panorama_and_why(folder, monkeypatch):

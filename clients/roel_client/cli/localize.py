@@ -16,6 +16,15 @@ from roel_service.errors import NoAnswerError
 
 FOUND = "FOUND"
 
+# Presets, and what each locates by.
+DEFAULT = "default"
+METHODS = {
+    "default": DEFAULT,
+    "paper": "fgpl",
+    "fgpl": "fgpl",
+    "fgpl-released": "fgpl-released",
+}
+
 
 def add_commands(subparsers: Subparsers) -> None:
     """Declare `localize`."""
@@ -46,9 +55,9 @@ def add_commands(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--preset",
         default="default",
-        type=one_of("default", "paper"),
+        type=one_of(*METHODS),
         metavar="NAME",
-        help="default",
+        help="default, or fgpl: FGPL as published, which is paper, too; or fgpl-released",
     )
     parser.add_argument("--config", metavar="FILE.toml", help="parameters that differ")
     parser.add_argument("--overlay", metavar="DIR", help="pictures with the map's lines over them")
@@ -61,16 +70,20 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
     """Locate panoramas, and print where each was taken as soon as it is known."""
     from roel_client import local
 
-    if options.preset == "paper":
-        raise UsageError("--preset", "default, the one preset of localization so far", "paper")
+    method = METHODS[options.preset]
+    for name in ("prior", "server"):
+        if method != DEFAULT and getattr(options, name) is not None:
+            raise UsageError("--preset", f"default, as there is --{name}", options.preset)
+    parameters = argparse.Namespace(preset=DEFAULT, config=options.config)
     maps = [options.map, *options.more_maps]
     asked: dict[str, Any] = {
         "prior": options.prior,
-        "config": effective_config(options).localize,
+        "config": effective_config(parameters).localize,
         "overlay": staged.get("overlay"),
     }
     if options.server is None:
-        report(local.localize_panoramas(maps, options.panoramas, **asked), options)
+        documents = local.localize_panoramas(maps, options.panoramas, method=method, **asked)
+        report(documents, options)
         return
     server = {"server": options.server, "options": server_options(options)}
     # A signal must reach the client, which then takes what it hosted away.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roel_service.arrays import Array, FloatArray, IntArray
-from roel_service.geometry.vectors import angle_between, dot, norm, unit
+from roel_service.geometry.vectors import dot, norm, unit
 from roel_service.pano_loc.arcs import PanoramaArcs
 
 # An intersection may lie this far beyond the ends of an arc, both ends together.
@@ -55,14 +55,17 @@ def intersections_of_arcs(arcs: PanoramaArcs, channel: IntArray) -> Intersection
     Args:
         channel: (A,) class of each arc; -1 for none.
     """
+    middles = unit(arcs.starts + arcs.ends)
+    # On one circle, both ends together are as far beyond as twice the way from the nearer one.
+    min_cosine = np.cos((arcs.length_rad + MAX_BEYOND_RAD) / 2)
     parts = []
     for k in range(3):
         i, j = _pairs(channel, k)
         crossing = unit(np.cross(arcs.normals[i], arcs.normals[j]))
+        cosine_i, cosine_j = dot(crossing, middles[i]), dot(crossing, middles[j])
         for sign in (1.0, -1.0):
-            points = sign * crossing
-            both = _is_on(points, arcs, i) & _is_on(points, arcs, j)
-            parts.append((k, points[both], np.stack([i[both], j[both]], axis=1)))
+            both = (sign * cosine_i > min_cosine[i]) & (sign * cosine_j > min_cosine[j])
+            parts.append((k, sign * crossing[both], np.stack([i[both], j[both]], axis=1)))
     return _collected(parts)
 
 
@@ -72,12 +75,6 @@ def _pairs(channel: IntArray, k: int) -> tuple[IntArray, IntArray]:
         np.flatnonzero(channel == k), np.flatnonzero(channel == (k + 1) % 3), indexing="ij"
     )
     return i.ravel(), j.ravel()
-
-
-def _is_on(points: FloatArray, arcs: PanoramaArcs, index: IntArray) -> Array:
-    """(N,) whether points lie on arcs, or not far beyond; NaN does not."""
-    beyond_rad = angle_between(points, arcs.starts[index]) + angle_between(points, arcs.ends[index])
-    return np.asarray(beyond_rad - arcs.length_rad[index] < MAX_BEYOND_RAD)
 
 
 def intersections_of_lines(segments: FloatArray, channel: IntArray) -> Intersections:

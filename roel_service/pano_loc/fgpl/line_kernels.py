@@ -61,7 +61,7 @@ def _absorb(
     """Let line i take in all that are alike, judged by its normal before the first."""
     own = normals[i].copy()
     for j in range(len(normals)):
-        if j == i or not alive[j] or abs(np.dot(own, normals[j])) <= MIN_COSINE:
+        if j == i or not alive[j] or abs(_dot(own, normals[j])) <= MIN_COSINE:
             continue
         ahead = (low[j] - low[i]) % TURN_RAD
         behind = (low[i] - low[j]) % TURN_RAD
@@ -69,7 +69,7 @@ def _absorb(
             continue
         sign = 1.0 if normals[i, axis[i]] * normals[j, axis[i]] > 0 else -1.0
         merged = normals[i] * length[i] + sign * normals[j] * length[j]
-        normals[i] = merged / np.sqrt(np.dot(merged, merged))
+        normals[i] = merged / np.sqrt(_dot(merged, merged))
         if ahead < reach[i]:
             reach[i] = max(reach[i], ahead + reach[j])
         else:
@@ -94,9 +94,15 @@ def _ray(normal: FloatArray, axis: int, longitude_rad: float) -> FloatArray:
         normal[(axis + 1) % 3] * ray[(axis + 1) % 3] + normal[(axis + 2) % 3] * ray[(axis + 2) % 3]
     )
     ray[axis] = -across / normal[axis]
-    return np.asarray(ray / np.sqrt(np.dot(ray, ray)))
+    return np.asarray(ray / np.sqrt(_dot(ray, ray)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _dot(a: FloatArray, b: FloatArray) -> float:
+    """Of three numbers each, for which a call of BLAS takes too long."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @numba.njit(cache=True, nogil=True)
 def _angle(a: FloatArray, b: FloatArray) -> float:
-    return float(np.arccos(min(1.0, max(-1.0, np.dot(a, b)))))
+    return float(np.arccos(min(1.0, max(-1.0, _dot(a, b)))))

@@ -25,6 +25,7 @@ from roel_service.pano_loc.fgpl.principal_directions import (
 # Coordinates of the pool lie within these quantiles, evenly if there are this many of them.
 QUANTILES = (0.1, 0.9)
 MANY_COORDINATES = 10
+MIN_EXTENT_SHARE = 0.02
 # Places this close to one of a hundredth of the lines' middles are no free space.
 MIN_DISTANCE_M = 0.3
 SAMPLED_SHARE = 0.01
@@ -35,7 +36,8 @@ RANKED_COUNT = 5
 def translation_pool(middles: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
     """(T, 3) m: about that many places among (L, 3) middles of lines."""
     low, high = np.quantile(middles, QUANTILES, axis=0)
-    extent = np.maximum(high - low, 1e-6)
+    # A map in a plane would ask for endless places along it.
+    extent = np.maximum(high - low, max(MIN_EXTENT_SHARE * np.max(high - low), 1e-6))
     axes = []
     for axis in range(3):
         others = extent[(axis + 1) % 3] * extent[(axis + 2) % 3]

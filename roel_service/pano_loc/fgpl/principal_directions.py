@@ -47,13 +47,13 @@ def directions_of_arcs(normals: FloatArray) -> FloatArray:
         normals: (A, 3) unit, of the arcs that vote.
     """
     points = vote_points()
-    votes_for = np.abs(normals @ points.T) < VOTE_SINE
-    voters = np.ones(len(normals), bool)
+    votes_for = (np.abs(normals @ points.T) < VOTE_SINE).astype(np.float32)
+    voters = np.ones(len(normals), np.float32)
     found: list[FloatArray] = []
     while voters.any() and len(found) < CANDIDATE_COUNT:
-        best = int(votes_for[voters].sum(axis=0).argmax())
+        best = int((voters @ votes_for).argmax())
         found.append(points[best])
-        voters &= ~votes_for[:, best]
+        voters *= 1 - votes_for[:, best]
     return _proper(_triple(np.array(found).reshape(-1, 3)))
 
 
