@@ -49,7 +49,7 @@ from roel_service.wire.configs import config_to_proto
 from roel_service.wire.delimited import delimited, messages
 from roel_service.wire.errors import error_from_status
 from roel_service.wire.localization import localize_request, prior_to_proto
-from roel_service.wire.nouns import camera_to_proto, trajectory_to_proto
+from roel_service.wire.nouns import camera_to_proto, trajectory_from_proto, trajectory_to_proto
 from roel_service.wire.registration import register_request
 from roel_service.wire.results import Report, progress_from_proto, report_from_proto
 
@@ -158,13 +158,63 @@ class Client:
         Returns:
             The bytes of the map file, and the report.
         """
-        with self._temporary_stream(camera) as stream, self._temporary_map() as map_name:
+        built = self.map_recording_with_poses(events, trajectory, camera, config, progress)
+        return built[0], built[1]
+
+    def map_recording_with_poses(
+        self,
+        events: EventSource,
+        trajectory: Trajectory,
+        camera: Camera,
+        config: Config,
+        progress: ProgressCallback = ignore,
+    ) -> tuple[bytes, Report, Trajectory | None]:
+        """The same, and the poses of the map; None unless they were refined."""
+        with (
+            self.hosted_recording(events, trajectory, camera, progress) as stream,
+            self._temporary_map() as map_name,
+        ):
+            operation = self.build_map(map_name, stream, config)
+            version = operation.wait(progress)
+            poses = None
+            if version.HasField("trajectory"):
+                poses = self.download_poses(version.trajectory)
+            rlm_bytes = self.download_map(version.name)
+            return rlm_bytes, report_from_proto(version.report), poses
+
+    def refine_recording(
+        self,
+        events: EventSource,
+        trajectory: Trajectory,
+        camera: Camera,
+        config: Config,
+        map_version: str | None = None,
+        progress: ProgressCallback = ignore,
+    ) -> tuple[Trajectory, maps_pb2.RefinePosesResponse]:
+        """Let the server refine poses as `refine_poses` would in process; no recording stays there.
+
+        Args:
+            map_version: a map that stays as it is; None refines lines and poses together.
+        """
+        with self.hosted_recording(events, trajectory, camera, progress) as stream:
+            operation = self.refine_poses(stream, config, map_version=map_version)
+            answer = operation.wait(progress)
+            return self.download_poses(answer.trajectory), answer
+
+    @contextlib.contextmanager
+    def hosted_recording(
+        self,
+        events: EventSource,
+        trajectory: Trajectory,
+        camera: Camera,
+        progress: ProgressCallback = ignore,
+    ) -> Iterator[str]:
+        """Name of a finalized recording that is there as long as the block lasts."""
+        with self._temporary_stream(camera) as stream:
             self.upload_poses(stream, trajectory)
             self.upload_events(stream, events, progress)
             self.finalize(stream)
-            operation = self.build_map(map_name, stream, config)
-            version = operation.wait(progress)
-            return self.download_map(version.name), report_from_proto(version.report)
+            yield stream
 
     def create_event_stream(self, stream_id: str, camera: Camera) -> str:
         """Open a recording; its name."""
@@ -262,6 +312,36 @@ class Client:
         )
         begun = self._connection.call(self._maps.BuildMap, request)
         return self.operation(begun.name)
+
+    def refine_poses(
+        self,
+        stream: str,
+        config: Config,
+        *,
+        map_version: str | None = None,
+        target_map: str | None = None,
+    ) -> Operation:
+        """Begin to refine the poses of a recording.
+
+        Args:
+            map_version: a map that stays as it is; None refines lines and poses together.
+            target_map: a map that gets a version of the lines seen from the refined poses.
+        """
+        request = maps_pb2.RefinePosesRequest(
+            event_stream=stream,
+            map_version=map_version,
+            target_map=target_map,
+            config=config_to_proto(config),
+        )
+        begun = self._connection.call(self._maps.RefinePoses, request)
+        return self.operation(begun.name)
+
+    def download_poses(self, blob: types_pb2.BlobRef) -> Trajectory:
+        """The poses of a refinement, or of a version."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "poses")
+            self.download_blob(blob.sha256, path)
+            return trajectory_from_proto(types_pb2.Trajectory.FromString(path.read_bytes()))
 
     def import_map(self, map_name: str, path: Path) -> Operation:
         """Begin to make a new version of a map from a file of lines."""

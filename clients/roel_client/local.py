@@ -61,7 +61,7 @@ class Built:
     """A finished map as a file's bytes, and the report of its build.
 
     Attributes:
-        trajectory: the poses of the map, where it was built in this process.
+        trajectory: the poses of the map; None where they are those that were given.
     """
 
     rlm_bytes: bytes
@@ -116,10 +116,10 @@ def build_map_remotely(
     from roel_client.client import Client
 
     with naming(recording.names), Client(server, **options) as client:
-        rlm_bytes, report = client.map_recording(
+        rlm_bytes, report, trajectory = client.map_recording_with_poses(
             recording.events, recording.trajectory, recording.camera, config, progress
         )
-    return Built(rlm_bytes=rlm_bytes, report=report)
+    return Built(rlm_bytes=rlm_bytes, report=report, trajectory=trajectory)
 
 
 def draw_map(built: Built, recording: Recording, path: Path) -> None:
@@ -155,15 +155,12 @@ def refine_poses(
         NoAnswerError: too few lines.
         RoelError: whatever reading and refining raise.
     """
-    import numpy as np
-
-    from roel_service.geometry.se3 import rotation_angle
-    from roel_service.mapping import refine_poses as poses
+    from roel_service.jobs import refinement
 
     started_s = time.perf_counter()
     line_map = None if map_name is None else _read_map(map_name)
     with naming(recording.names):
-        found = poses.refine_poses(
+        trajectory, report = refinement.refine_poses(
             recording.events,
             recording.trajectory,
             recording.camera,
@@ -171,19 +168,49 @@ def refine_poses(
             line_map=line_map,
             progress=progress,
         )
-    write_poses(found.trajectory, out)
-    before, after = recording.trajectory.T_world_camera, found.trajectory.T_world_camera
-    shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
-    turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+    write_poses(trajectory, out)
+    return {**report, "seconds": time.perf_counter() - started_s}
+
+
+def refine_poses_remotely(
+    recording: Recording,
+    map_name: str | None,
+    config: Config,
+    out: Path,
+    progress: ProgressCallback,
+    *,
+    server: str,
+    options: dict[str, Any],
+) -> dict[str, Any]:
+    """Let a server refine the poses; as `refine_poses`.
+
+    Args:
+        map_name: a file, or a version that the server has.
+        server: `HOST:PORT`.
+        options: arguments of `Client` beside the address.
+    """
+    from roel_client.client import Client
+
+    started_s = time.perf_counter()
+    with ExitStack() as resources:
+        resources.enter_context(naming(recording.names))
+        client = resources.enter_context(Client(server, **options))
+        version = None
+        if map_name is not None:
+            version = resources.enter_context(_hosted(client, map_name))
+        trajectory, answer = client.refine_recording(
+            recording.events, recording.trajectory, recording.camera, config, version, progress
+        )
+    write_poses(trajectory, out)
     return {
-        "pose_count": len(found.trajectory),
-        "line_count": found.report.line_count,
-        "iterations": found.report.iteration_count,
-        "converged": found.report.converged,
-        "cost_initial": found.report.cost_initial,
-        "cost_final": found.report.cost_final,
-        "mean_shift_m": float(shift_m.mean()),
-        "mean_turn_deg": float(np.degrees(turn_rad).mean()),
+        "pose_count": answer.pose_count,
+        "line_count": answer.line_count,
+        "iterations": answer.iteration_count,
+        "converged": answer.converged,
+        "cost_initial": answer.cost_initial,
+        "cost_final": answer.cost_final,
+        "mean_shift_m": answer.mean_shift_m,
+        "mean_turn_deg": answer.mean_turn_deg,
         "seconds": time.perf_counter() - started_s,
     }
 

@@ -38,6 +38,7 @@ from roel_service.scene.lines import LineMap
 from roel_service.scene.results import MAPPING_STAGES
 from roel_service.scene.trajectory import Trajectory
 from roel_service.store.builds import BuiltVersion
+from roel_service.wire.nouns import trajectory_to_proto
 from roel_service.wire.provenance import EventDigest, Provenance, camera_digest, poses_digest
 from roel_service.wire.results import Report
 from roel_service.wire.rlm import decode_map, encode_map
@@ -84,9 +85,9 @@ def run_build(parameters: BuildParameters | FollowParameters, tell: Tell) -> Bui
         tell,
         cache=_cache(parameters),
         known=known,
-        on_preview=lambda preview: tell(Partial(result=_version(preview))),
+        on_preview=lambda preview: tell(Partial(result=built_version(preview, with_poses=False))),
     )
-    return _version(built)
+    return built_version(built, with_poses=parameters.config.refine.free_poses)
 
 
 def build_map(
@@ -193,8 +194,11 @@ def versions() -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def _version(built: BuiltMap) -> BuiltVersion:
+def built_version(built: BuiltMap, *, with_poses: bool) -> BuiltVersion:
+    """A map as its version's row has it, with its poses if they are not those of the recording."""
+    poses = trajectory_to_proto(built.trajectory).SerializeToString() if with_poses else b""
     return BuiltVersion(
+        trajectory=bytes(poses),
         rlm_bytes=built.rlm_bytes,
         line_count=len(built.line_map),
         bounds_m=built.line_map.bounds_m.ravel().tolist(),

@@ -14,11 +14,14 @@ from roel_service.jobs.inputs import (
     FollowParameters,
     sealed_parameters,
 )
+from roel_service.jobs.questions import MapFile
+from roel_service.jobs.refine_inputs import RefineParameters
 from roel_service.store.garbage import LONGEST_UPLOAD_S
 from roel_service.store.records import OperationRecord, StreamState, TaskRecord
 from roel_service.store.store import CACHE, Store
-from roel_service.v1 import config_pb2
+from roel_service.v1 import config_pb2, maps_pb2
 from roel_service.wire.configs import config_from_proto, config_to_proto
+from roel_service.wire.nouns import trajectory_from_proto
 
 
 class Prepared(NamedTuple):
@@ -74,6 +77,29 @@ def event_import_preparation(store: Store, max_size_bytes: int) -> Prepare:
             fence=int(task.parameters),
         )
         return Prepared("roel_service.jobs.event_imports:run_event_import", parameters)
+
+    return prepare
+
+
+def refinement_preparation(store: Store) -> Prepare:
+    """How a refinement is prepared: its task has the request, and names the map that is fixed."""
+
+    def prepare(operation: OperationRecord, task: TaskRecord) -> Prepared:
+        request = maps_pb2.RefinePosesRequest.FromString(task.parameters)
+        stream = store.event_streams.get(operation.event_stream_id)
+        config = config_from_proto(request.config, "default")
+        fixed = store.refinements.fixed_map(task)
+        parameters = RefineParameters(
+            recording=sealed_parameters(store.event_streams, stream, config, None),
+            trajectory=(
+                trajectory_from_proto(request.trajectory)
+                if request.HasField("trajectory")
+                else None
+            ),
+            fixed_map=fixed and MapFile(name=request.map_version, sha256=fixed[0], path=fixed[1]),
+            makes_version=bool(operation.map_id),
+        )
+        return Prepared("roel_service.jobs.refinement:run_refinement", parameters)
 
     return prepare
 

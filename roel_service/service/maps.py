@@ -26,7 +26,8 @@ from roel_service.store.records import MapVersionRecord
 from roel_service.store.store import Store
 from roel_service.v1 import maps_pb2
 from roel_service.wire import names
-from roel_service.wire.configs import config_from_proto
+from roel_service.wire.configs import config_from_proto, config_to_proto
+from roel_service.wire.nouns import trajectory_from_proto
 from roel_service.wire.rlm import MapBlocks
 
 DEFAULT_PRESET = "default"
@@ -112,6 +113,29 @@ class MapServicer:
             parameters=build_parameters_to_bytes(config),
             request=identity,
             follow=request.follow,
+        )
+        return await submitted(self._store, self._scheduler, begin, identity)
+
+    async def RefinePoses(
+        self, request: maps_pb2.RefinePosesRequest, context: Any
+    ) -> operations_pb2.Operation:
+        stream_id = names.event_stream_id(request.event_stream)
+        target_map_id = names.map_id(request.target_map) if request.target_map else ""
+        parameters = _refinement(request)
+        fixed_map_sha256 = ""
+        if request.map_version:
+            fixed = await self._version(request.map_version)
+            fixed_map_sha256 = (await asyncio.to_thread(self._store.maps.map_path, fixed)).name
+            parameters.map_version = _name(fixed)
+        identity = request_id(request)
+        begin = partial(
+            self._store.refinements.begin,
+            stream_id,
+            parameters.SerializeToString(deterministic=True),
+            fixed_map_sha256=fixed_map_sha256,
+            target_map_id=target_map_id,
+            request_sha256=content_sha256(request),
+            request=identity,
         )
         return await submitted(self._store, self._scheduler, begin, identity)
 
@@ -253,8 +277,19 @@ def _validated(map_id: str, version: int, event_stream: str) -> operations_pb2.O
     return operation
 
 
-def _requested_config(request: maps_pb2.BuildMapRequest) -> Config:
-    """The configuration of a build.
+def _refinement(request: maps_pb2.RefinePosesRequest) -> maps_pb2.RefinePosesRequest:
+    """What a refinement needs to know beside rows; raises `ConfigError`, `TrajectoryError`."""
+    parameters = maps_pb2.RefinePosesRequest(config=config_to_proto(_requested_config(request)))
+    if request.HasField("trajectory"):
+        trajectory_from_proto(request.trajectory)
+        parameters.trajectory.CopyFrom(request.trajectory)
+    return parameters
+
+
+def _requested_config(
+    request: maps_pb2.BuildMapRequest | maps_pb2.RefinePosesRequest,
+) -> Config:
+    """The configuration of a build or a refinement.
 
     Raises:
         ConfigError: of `config_from_proto`; a file is named: the server would open its own.

@@ -19,6 +19,7 @@ from roel_service.service.records import (
     event_stream_to_proto,
     map_version_to_proto,
     operation_to_proto,
+    refinement_answer,
 )
 from roel_service.store.records import OperationMethod, OperationRecord, OperationState
 from roel_service.store.requests import RequestId
@@ -132,6 +133,9 @@ def _answer(store: Store, record: OperationRecord) -> Any:
     with contextlib.suppress(NotFoundError):
         if record.method is OperationMethod.IMPORT_EVENT_STREAM:
             return event_stream_to_proto(store.event_streams.get(record.event_stream_id))
+        if record.method is OperationMethod.REFINE_POSES:
+            version = store.maps.made_version(record) if record.map_id else None
+            return refinement_answer(record, version)
         if record.method in BATCH_ANSWERS:
             return batch_answer(record)
         return map_version_to_proto(store.maps.made_version(record))

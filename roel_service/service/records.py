@@ -107,6 +107,11 @@ def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
         message.provenance.CopyFrom(map_file_pb2.MapProvenance(**record.provenance))
     if record.state.is_usable and record.report:
         message.report.CopyFrom(report_to_proto(record.report))
+    if record.trajectory_sha256:
+        poses = types_pb2.BlobRef(
+            sha256=record.trajectory_sha256, size_bytes=record.trajectory_bytes
+        )
+        message.trajectory.CopyFrom(poses)
     if record.imported_file:
         message.imported_file.CopyFrom(_imported_file(record.imported_file))
     if record.state is VersionState.DELETED:
@@ -136,6 +141,21 @@ def batch_answer(record: OperationRecord) -> Any:
         item_count=result["item_count"],
         failed_count=result["failed_count"],
     )
+
+
+def refinement_answer(
+    record: OperationRecord, version: MapVersionRecord | None
+) -> maps_pb2.RefinePosesResponse:
+    """What a refinement that SUCCEEDED answers with."""
+    result = json.loads(record.result)
+    trajectory = types_pb2.BlobRef(sha256=result.pop("sha256"), size_bytes=result.pop("size_bytes"))
+    iteration_count = result.pop("iterations")
+    answer = maps_pb2.RefinePosesResponse(
+        trajectory=trajectory, iteration_count=iteration_count, **result
+    )
+    if version is not None:
+        answer.map_version.CopyFrom(map_version_to_proto(version))
+    return answer
 
 
 def operation_to_proto(record: OperationRecord, answer: Message | None) -> operations_pb2.Operation:
@@ -175,6 +195,10 @@ def _stream_name(record: OperationRecord) -> str:
     return names.event_stream_name(record.event_stream_id)
 
 
+def _refined_name(record: OperationRecord) -> str:
+    return _version_name(record) if record.map_id else _stream_name(record)
+
+
 def _project(record: OperationRecord) -> str:
     return names.PROJECT
 
@@ -184,6 +208,7 @@ _TARGETS: dict[OperationMethod, Callable[[OperationRecord], str]] = {
     OperationMethod.BUILD_MAP: _version_name,
     OperationMethod.IMPORT_MAP: _version_name,
     OperationMethod.IMPORT_EVENT_STREAM: _stream_name,
+    OperationMethod.REFINE_POSES: _refined_name,
     OperationMethod.BATCH_REGISTER: _project,
     OperationMethod.BATCH_LOCALIZE: _project,
 }

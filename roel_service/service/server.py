@@ -22,6 +22,7 @@ from roel_service.jobs.preparation import (
     build_preparation,
     event_import_preparation,
     import_preparation,
+    refinement_preparation,
 )
 from roel_service.jobs.scheduler import Policy, Scheduler
 from roel_service.jobs.upkeep import upkeep
@@ -169,6 +170,7 @@ def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
             OperationMethod.IMPORT_EVENT_STREAM: event_import_preparation(
                 store, settings.event_stream_bytes
             ),
+            OperationMethod.REFINE_POSES: refinement_preparation(store),
             OperationMethod.BATCH_REGISTER: batch(BATCH_REGISTER),
             OperationMethod.BATCH_LOCALIZE: batch(BATCH_LOCALIZE),
         },

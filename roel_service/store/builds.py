@@ -36,6 +36,7 @@ class BuiltVersion:
         report: as the command line prints it; empty for an import.
         provenance: what the map was made of.
         imported_file: what it was read from; empty for a build.
+        trajectory: its poses, serialized, if they were refined; else empty.
     """
 
     rlm_bytes: bytes
@@ -44,6 +45,7 @@ class BuiltVersion:
     report: dict[str, Any]
     provenance: dict[str, str] = field(default_factory=dict)
     imported_file: dict[str, Any] = field(default_factory=dict)
+    trajectory: bytes = b""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +183,8 @@ class VersionCompletion:
             "report": built.report,
             "provenance": built.provenance,
             "imported_file": built.imported_file,
+            "trajectory_sha256": self._blobs.put(built.trajectory) if built.trajectory else "",
+            "trajectory_bytes": len(built.trajectory),
         }
         _change_version(connection, operation, changes)
 

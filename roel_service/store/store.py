@@ -27,6 +27,7 @@ from roel_service.store.operations import Operations
 from roel_service.store.principals import Principals
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
+from roel_service.store.refinements import RefinementCompletion, Refinements
 from roel_service.store.requests import delete_expired_requests
 from roel_service.store.tasks import Tasks
 from roel_service.store.uploads import Uploads
@@ -46,8 +47,8 @@ class Store:
 
     Attributes:
         folder: where it is.
-        event_streams, event_imports, uploads, maps, builds, batches, operations, tasks: the
-            repositories.
+        event_streams, event_imports, uploads, maps, builds, refinements, batches, operations,
+            tasks: the repositories.
         principals, audit: who may call, and who changed what.
 
     Raises:
@@ -71,6 +72,7 @@ class Store:
             self.builds = Builds(self._database, self._blobs)
             self.principals = Principals(self._database)
             self.audit = Audit(self._database, AUDIT_ROW_COUNT)
+            self.refinements = Refinements(self._database, self._blobs)
             self.batches = Batches(self._database, self._blobs, folder / "batches")
             versions, batches = VersionCompletion(self._blobs), BatchCompletion(self._blobs)
             self.operations = Operations(
@@ -79,6 +81,7 @@ class Store:
                     OperationMethod.BUILD_MAP: versions,
                     OperationMethod.IMPORT_MAP: versions,
                     OperationMethod.IMPORT_EVENT_STREAM: EventImportCompletion(self._recordings),
+                    OperationMethod.REFINE_POSES: RefinementCompletion(self._blobs, versions),
                     OperationMethod.BATCH_REGISTER: batches,
                     OperationMethod.BATCH_LOCALIZE: batches,
                 },

@@ -118,8 +118,6 @@ def build_map(options: argparse.Namespace, staged: Staged) -> None:
 def _check_poses_out(options: argparse.Namespace) -> None:
     if not options.refine_poses:
         raise UsageError("--poses-out", "--refine-poses beside it", options.poses_out)
-    if options.server is not None:
-        raise UsageError("--poses-out", "no --server beside it", f"--server {options.server}")
 
 
 def poses_table(options: argparse.Namespace) -> Tables:

@@ -14,6 +14,8 @@ from roel_client.cli.configuration import (
 from roel_client.cli.maps import add_recording_options
 from roel_client.cli.output import print_result, progress_bar
 from roel_client.cli.parser import Command, Subparsers, command
+from roel_client.cli.process import interruptible
+from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
 
 
@@ -28,6 +30,7 @@ def add_commands(subparsers: Subparsers) -> None:
     parser.add_argument("--out", required=True, metavar="POSES.txt", help="TUM text")
     add_config_options(parser)
     add_seed_option(parser)
+    add_server_options(parser, required=False, what="let this server refine the poses")
     parser.add_argument("--json", action="store_true", help="print as JSON")
 
 
@@ -40,7 +43,20 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
-        result = local.refine_poses(recording, options.map, config, staged["out"], progress)
+        if options.server is None:
+            result = local.refine_poses(recording, options.map, config, staged["out"], progress)
+        else:
+            # A signal must reach the client, which then ends the work on the server too.
+            with interruptible():
+                result = local.refine_poses_remotely(
+                    recording,
+                    options.map,
+                    config,
+                    staged["out"],
+                    progress,
+                    server=options.server,
+                    options=server_options(options),
+                )
     print_result(result, _told(result, options.out), as_json=options.json)
 
 

@@ -1,0 +1,95 @@
+"""Poses of a recording, refined: the one step that the command line and the children share."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+
+from roel_service.config.stages import Config
+from roel_service.geometry.se3 import rotation_angle
+from roel_service.jobs.build import build_map, built_version
+from roel_service.jobs.refine_inputs import RefineParameters
+from roel_service.jobs.task import Tell
+from roel_service.mapping import refine_poses as poses
+from roel_service.progress import ProgressCallback, ignore, part_of
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventSource
+from roel_service.scene.lines import LineMap
+from roel_service.scene.results import PoseResult
+from roel_service.scene.trajectory import Trajectory
+from roel_service.store.refinements import RefinedPoses
+from roel_service.wire.nouns import trajectory_to_proto
+
+# Share of the work, where lines are wanted too.
+POSES_SHARE = 0.6
+
+
+def refine_poses(
+    events: EventSource,
+    trajectory: Trajectory,
+    camera: Camera,
+    config: Config,
+    *,
+    line_map: LineMap | None = None,
+    progress: ProgressCallback = ignore,
+) -> tuple[Trajectory, dict[str, Any]]:
+    """Refined poses, and how that went with the keys that `roel refine-poses` prints.
+
+    Raises:
+        NoAnswerError: too few lines.
+        RoelError: whatever reading and refining raise.
+    """
+    started_s = time.perf_counter()
+    found = poses.refine_poses(
+        events, trajectory, camera, config, line_map=line_map, progress=progress
+    )
+    return found.trajectory, _report(found, trajectory, time.perf_counter() - started_s)
+
+
+def run_refinement(parameters: RefineParameters, tell: Tell) -> RefinedPoses:
+    """Entry point of a refinement in a child; errors as of `refine_poses` and `build_map`."""
+    events, trajectory, camera = parameters.recording.open()
+    config, fixed_map = parameters.recording.config, parameters.fixed_map
+    trajectory, report = refine_poses(
+        events,
+        parameters.trajectory or trajectory,
+        camera,
+        config,
+        line_map=None if fixed_map is None else fixed_map.line_map(),
+        progress=part_of(tell, 0.0, POSES_SHARE) if parameters.makes_version else tell,
+    )
+    version = None
+    if parameters.makes_version:
+        # The poses are as good as they get.
+        fixed = dataclasses.replace(
+            config, refine=dataclasses.replace(config.refine, free_poses=False)
+        )
+        rest = part_of(tell, POSES_SHARE, 1.0)
+        built = build_map(events, trajectory, camera, fixed, rest)
+        version = built_version(built, with_poses=True)
+    message = trajectory_to_proto(trajectory)
+    return RefinedPoses(
+        trajectory=bytes(message.SerializeToString(deterministic=True)),
+        report=report,
+        version=version,
+    )
+
+
+def _report(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, Any]:
+    before, after = given.T_world_camera, found.trajectory.T_world_camera
+    shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
+    turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+    return {
+        "pose_count": len(found.trajectory),
+        "line_count": found.report.line_count,
+        "iterations": found.report.iteration_count,
+        "converged": found.report.converged,
+        "cost_initial": found.report.cost_initial,
+        "cost_final": found.report.cost_final,
+        "mean_shift_m": float(shift_m.mean()),
+        "mean_turn_deg": float(np.degrees(turn_rad).mean()),
+        "seconds": seconds,
+    }
