@@ -30,14 +30,16 @@ from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.io.clouds import write_npz
 from roel_service.io.images import decode_panorama
 from roel_service.jobs.batch_inputs import BatchParameters
-from roel_service.jobs.batches import run_batch_localize
+from roel_service.jobs.batches import run_batch_localize, run_batch_register
 from roel_service.pano_loc.localize import localize_panorama
 from roel_service.pano_loc.prepare import prepare_map
+from roel_service.progress import ignore
 from roel_service.register.register import register_map
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.results import LocalizationStatus
+from roel_service.store.builds import BuiltVersion
 from roel_service.store.principals import Role
-from roel_service.store.store import opened_principals
+from roel_service.store.store import Store, opened_principals
 from roel_service.v1 import (
     config_pb2,
     localization_pb2,
@@ -46,7 +48,7 @@ from roel_service.v1 import (
     registration_pb2_grpc,
     types_pb2,
 )
-from roel_service.wire.delimited import delimited
+from roel_service.wire.delimited import delimited, messages
 from roel_service.wire.errors import error_from_status
 from roel_service.wire.localization import localization_from_proto, localize_request
 from roel_service.wire.provenance import Provenance
@@ -80,8 +82,42 @@ def tokens(data):
         return {role: principals.create(role.label, role) for role in (Role.ADMIN, ROBOT)}
 
 
+MAPS = {
+    "room": room_map(),
+    "here": map_of(),
+    "there": map_of(OTHER_ROOM, OTHER_FURNITURE),
+}
+
+
 @pytest.fixture(scope="module")
-def server(data, tokens):
+def versions(data):
+    """Names of versions that are there when the server starts, by their maps."""
+    with Store(data) as store:
+        for name, line_map in MAPS.items():
+            store.maps.create(name)
+            rlm_bytes = encode_map(line_map, Provenance())
+            store.builds.begin_import(name, store.builds.put_import(rlm_bytes))
+            task = store.tasks.lease("test")
+            version = BuiltVersion(
+                rlm_bytes=rlm_bytes, line_count=len(line_map), bounds_m=[0.0] * 6, report={}
+            )
+            store.operations.succeed(task.lease, version)
+    return {name: f"projects/default/maps/{name}/versions/v1" for name in MAPS}
+
+
+@pytest.fixture(scope="module")
+def version(versions):
+    return versions["room"]
+
+
+@pytest.fixture(scope="module")
+def places(versions):
+    """The room of the picture, and another one."""
+    return [versions["here"], versions["there"]]
+
+
+@pytest.fixture(scope="module")
+def server(data, tokens, versions):
     running = Server(data, interactive_workers=1, interactive_queued=4, inline_point_count=5000)
     yield running
     assert running.stop() == 0
@@ -121,11 +157,6 @@ def line_map(folder):
 
 
 @pytest.fixture(scope="module")
-def version(client, folder):
-    return client.import_map(client.create_map("room"), folder / "map.rlm").wait().name
-
-
-@pytest.fixture(scope="module")
 def cloud(client, folder):
     return client.upload_blob(folder / "cloud.npz")
 
@@ -159,17 +190,6 @@ def picture():
     """What a panorama shows of the room with the furniture, as a PNG file."""
     drawn = wireframe_panorama(TRUTH, segments_of(), 768)
     return cv2.imencode(".png", drawn)[1].tobytes()
-
-
-@pytest.fixture(scope="module")
-def places(client, tmp_path_factory):
-    """Names of versions: the room of the picture, and another one."""
-    folder = tmp_path_factory.mktemp("places")
-    found = []
-    for name, line_map in (("here", map_of()), ("there", map_of(OTHER_ROOM, OTHER_FURNITURE))):
-        (folder / name).write_bytes(encode_map(line_map, Provenance()))
-        found.append(client.import_map(client.create_map(name), folder / name))
-    return [operation.wait().name for operation in found]
 
 
 class TestLocalize:
@@ -346,14 +366,6 @@ class TestStream:
             stream.send(2, picture)
             assert stream.receive().response.status == FOUND
 
-    def test_pictures_beyond_the_credit_end_the_stream(self, client, places, picture):
-        with client.localizing(places[:1], T_prior=TRUTH, config=FAST) as stream:
-            for picture_id in range(6):
-                stream.send(picture_id, picture)
-            with pytest.raises(LimitError) as caught:
-                list(iter(stream.receive, None))
-        assert caught.value.reason == "CREDIT_EXCEEDED"
-
     @pytest.mark.parametrize(
         ("requests", "message"),
         [
@@ -380,6 +392,19 @@ def requests(places, picture):
     return asked
 
 
+def batch(data, manifest, item_count, journal, earlier_journals=()):
+    return BatchParameters(
+        folder=data,
+        manifest=manifest,
+        item_count=item_count,
+        max_item_bytes=2**22,
+        journal=journal,
+        earlier_journals=earlier_journals,
+        cache=None,
+        inline_point_count=0,
+    )
+
+
 class TestBatch:
     def test_every_request_has_its_answer_or_its_error(self, client, requests, places):
         answer = client.batch_localize(requests).wait()
@@ -389,17 +414,6 @@ class TestBatch:
         assert found.response.map_versions == places[:1]
         reasons = [error_from_status(item.error).reason for item in failed]
         assert reasons == ["PANORAMA_INVALID", "NOT_FOUND"]
-
-    def test_registrations_are_batched_alike(self, connection, client, version, cloud):
-        stub = registration_pb2_grpc.RegistrationServiceStub(connection.channel)
-        request = registration_pb2.BatchRegisterRequest(
-            parent="projects/default", requests=[register_request(version, cloud, config=COARSE)]
-        )
-        operation = client.operation(connection.call(stub.BatchRegister, request).name)
-        (item,) = client.batch_items(operation.wait())
-        assert item.response.map_version == version
-        again = connection.call(stub.BatchRegister, request)
-        assert again.name == operation.name
 
     @pytest.mark.parametrize(
         ("fields", "error", "message"),
@@ -429,16 +443,8 @@ class TestBatch:
         manifest.write_bytes(b"".join(map(delimited, requests)))
 
         def attempt(name, earlier=(), end_at=9):
-            parameters = BatchParameters(
-                folder=data,
-                manifest=manifest,
-                item_count=3,
-                max_item_bytes=2**22,
-                journal=tmp_path / name,
-                earlier_journals=[tmp_path / path for path in earlier],
-                cache=None,
-                inline_point_count=0,
-            )
+            earlier_journals = [tmp_path / path for path in earlier]
+            parameters = batch(data, manifest, 3, tmp_path / name, earlier_journals)
             told = []
 
             def tell(progress):
@@ -462,46 +468,49 @@ class TestBatch:
         assert (resumed.item_count, resumed.failed_count) == (3, whole.failed_count)
         assert (tmp_path / "third").read_bytes().startswith(torn)
 
+    def test_registrations_are_batched_alike(self, data, version, cloud, tmp_path):
+        asked = [register_request(name, cloud, config=COARSE) for name in (version, NOWHERE)]
+        (tmp_path / "manifest").write_bytes(b"".join(map(delimited, asked)))
+        done = run_batch_register(batch(data, tmp_path / "manifest", 2, tmp_path / "items"), ignore)
+        assert (done.item_count, done.failed_count) == (2, 1)
+        with done.journal.open("rb") as file:
+            first, second = messages(
+                file, registration_pb2.BatchRegisterItem, subject="items", max_bytes=2**22
+            )
+        assert first.response.map_version == version
+        assert error_from_status(second.error).reason == "NOT_FOUND"
+
 
 @pytest.mark.parametrize("command", [register, localize])
-def test_the_command_asks_a_server(server, tokens, folder, monkeypatch, capsys, command):
+def test_the_command_asks_a_server(server, tokens, version, folder, monkeypatch, capsys, command):
     monkeypatch.chdir(folder)
     monkeypatch.setenv("ROEL_TOKEN", tokens[Role.ADMIN])
     target = "cloud.npz" if command is register else "room.png"
     guess = "--init" if command is register else "--prior"
-    line = [command.__name__, "map.rlm", target, guess, "T.txt", "--config", "coarse.toml"]
+    line = [target, guess, "T.txt", "--config", "coarse.toml"]
     printed = []
-    for more in ([], ["--server", server.address]):
-        command(parser().parse_args([*line, *more]), {})
+    for where in (["map.rlm"], [version, "--server", server.address]):
+        command(parser().parse_args([command.__name__, *where, *line]), {})
         printed.append(capsys.readouterr().out)
     assert printed[0] == printed[1] != ""
 
 
 def test_a_batch_of_files_has_the_same_rows_here_and_on_a_server(
-    server, tokens, folder, capsys, monkeypatch
+    server, tokens, version, folder, capsys, monkeypatch
 ):
     monkeypatch.setenv("ROEL_TOKEN", tokens[Role.ADMIN])
     (folder / "manifest.txt").write_text("room.png\nT.txt\n")
     rows = []
-    for more in ([], ["--server", server.address]):
-        out = folder / f"rows-{len(more)}.jsonl"
-        line = ["batch", "localize", folder / "manifest.txt", "--maps", folder / "map.rlm"]
-        line += [
-            "--out",
-            out,
-            "--config",
-            folder / "coarse.toml",
-            "--workers",
-            "1",
-            "--json",
-            *more,
-        ]
+    for where in ([folder / "map.rlm"], [version, "--server", server.address]):
+        out = folder / f"rows-{len(where)}.jsonl"
+        line = ["batch", "localize", folder / "manifest.txt", "--out", out, "--maps", *where]
+        line += ["--config", folder / "coarse.toml", "--workers", "1", "--json"]
         options = parser().parse_args(list(map(str, line)))
         options.command.run(options, {})
         assert json.loads(capsys.readouterr().out)["failed_count"] == 1
         rows.append([json.loads(text) for text in out.read_text().splitlines()])
         assert not out.with_name(f"{out.name}.partial").exists()
     for row in (*rows[0], *rows[1]):
-        row["seconds"] = None
+        row["seconds"] = row["map"] = None
     assert rows[0] == rows[1]
     assert [row["reason"] for row in rows[0]][1] == "PANORAMA_INVALID"
