@@ -15,7 +15,7 @@ from pathlib import Path
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import LocalizeConfig, RegisterConfig
-from roel_service.errors import CorruptionError, InputError, LimitError
+from roel_service.errors import ConfigError, CorruptionError, InputError, LimitError
 from roel_service.geometry.se3 import SE3
 from roel_service.jobs.inputs import CachePlace
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
@@ -161,8 +161,11 @@ class Questions:
         """Where and how to look, for any picture; raises as `registration`."""
         if request.HasField("camera"):
             raise InputError("camera", "none: pictures are panoramas", "one")
+        if request.preset not in ("", DEFAULT_PRESET):
+            # The others are other methods, anchors of the benchmark.
+            raise ConfigError("preset", DEFAULT_PRESET, request.preset)
         tables = config_pb2.MappingConfig(localize=request.config)
-        config = config_from_proto(tables, request.preset or DEFAULT_PRESET).localize
+        config = config_from_proto(tables).localize
         return LocalizeQuestion(
             maps=self._map_files(request.map_versions),
             image=b"",

@@ -239,6 +239,7 @@ class TestLocalize:
                 "up_panorama: expected a unit vector, found one of length 2",
             ),
             ({"up_sigma_deg": 100.0, "up_world": UP, "up_panorama": UP}, InputError, "0 to 90"),
+            ({"preset": "paper"}, ConfigError, "preset: expected default, found paper"),
             ({"camera": types_pb2.Camera()}, InputError, "camera: expected none"),
             ({"prior": types_pb2.Transform()}, InputError, "prior: expected 9 numbers"),
             ({"image": b"GIF89a"}, PanoramaError, "image: expected a JPEG or PNG picture"),
