@@ -143,7 +143,7 @@ def match(pose: SE3, samples: Samples, prepared: PreparedMap, max_angle_rad: flo
 def equations(
     pose: SE3, samples: Samples, prepared: PreparedMap, width_rad: float
 ) -> tuple[FloatArray, FloatArray]:
-    """(6, 6) and (6,) of the Gauss-Newton step at a pose, tangent (r, d)."""
+    """(6, 6) of the Gauss-Newton step at a pose, and (L, 6) gradient by line; tangent (r, d)."""
     found = match(pose, samples, prepared, FINAL_GATE_RAD)
     H, g = refine_kernels.normal_equations(
         found.rays,
@@ -164,8 +164,9 @@ def explained(pose: SE3, samples: Samples, prepared: PreparedMap) -> float:
     return float(samples.weight @ fit / max(samples.weight.sum(), 1e-9))
 
 
-def _step(H: FloatArray, g: FloatArray) -> FloatArray:
+def _step(H: FloatArray, gradients: FloatArray) -> FloatArray:
     """(6,) damped step, shortened to what stays linear."""
+    g = gradients.sum(axis=0)
     damping = DAMPING * np.diag(np.maximum(np.diag(H), 1e-9))
     step = -np.linalg.solve(H + damping, g)
     shrink = max(

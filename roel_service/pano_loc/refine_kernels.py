@@ -122,13 +122,13 @@ def normal_equations(
     residual: FloatArray,
     scale_rad: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """(6, 6) and (6,) Gauss-Newton sums of Geman-McClure weighted residuals, tangent (r, d).
+    """(6, 6) Gauss-Newton sum of Geman-McClure weighted residuals, and (L, 6) gradient by line.
 
-    The residual of a ray y is y . N, N the unit normal of the plane of centre and line; rays are in
-    the world's frame.
+    Tangent (r, d). The residual of a ray y is y . N, N the unit normal of the plane of centre and
+    line; rays are in the world's frame.
     """
     normal, moment = seen[0], seen[1]
-    H, g = np.zeros((6, 6)), np.zeros(6)
+    H, g = np.zeros((6, 6)), np.zeros((len(segments), 6))
     J = np.empty(6)
     for s in range(len(rays)):
         j = line[s]
@@ -137,7 +137,7 @@ def normal_equations(
         jacobian(rays[s], segments[j], normal[j], moment[j], J)
         robust = weight[s] / (1.0 + (residual[s] / scale_rad) ** 2) ** 2
         for p in range(6):
-            g[p] += robust * residual[s] * J[p]
+            g[j, p] += robust * residual[s] * J[p]
             for q in range(6):
                 H[p, q] += robust * J[p] * J[q]
     return H, g

@@ -43,10 +43,10 @@ MAX_SIGMA_M, MAX_SIGMA_RAD = 0.3, np.deg2rad(15.0)
 # Map lines may be hidden: their share counts half.
 COVERAGE_WEIGHT = 0.5
 POINT_SPACING_M = 0.1
-# Errors of the samples of one line are alike: so many degrees of arc count as one measurement.
-INDEPENDENT_RAD = np.deg2rad(20.0)
-# No pose is more certain than the map's own frame.
-FLOOR_RAD, FLOOR_M = np.deg2rad(0.02), 1e-3
+# What nothing holds gets a variance of 1, rad^2 or m^2.
+WEAKEST = 1e-7
+# What maps built from events are off as a whole, which no residual shows.
+FLOOR_RAD, FLOOR_M = np.deg2rad(0.025), 8e-4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -183,11 +183,15 @@ def covered(pose: SE3, arcs: PanoramaArcs, prepared: PreparedMap) -> float:
 
 
 def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap) -> FloatArray:
-    """(6, 6) of (r, d): the kernel's width as the noise of independent stretches of arc."""
-    H, _ = equations(pose, samples, prepared, FINAL_WIDTHS_RAD[-1])
-    information = H / (INDEPENDENT_RAD * FINAL_WIDTHS_RAD[-1] ** 2)
-    # What nothing holds gets a large but finite variance.
-    weakest = np.diag([1e-2] * 6)
+    """(6, 6) of (r, d): what the residuals of whole lines say about each other's pull.
+
+    All samples of a line err together, and lines err independently.
+    """
+    H, gradients = equations(pose, samples, prepared, FINAL_WIDTHS_RAD[-1])
+    inverse = np.linalg.inv(H + WEAKEST * np.eye(6))
+    pull = gradients.T @ gradients
+    line_count = int(np.count_nonzero(gradients.any(axis=1)))
+    few = line_count / max(line_count - 6, 1)
     floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-    covariance = np.linalg.inv(information + weakest) + floor
+    covariance = few * inverse @ pull @ inverse + WEAKEST * inverse + floor
     return np.asarray((covariance + covariance.T) / 2)
