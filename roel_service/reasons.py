@@ -88,7 +88,11 @@ _ROWS = (
     Reason("CLOUD_INVALID", CloudError, "a point cloud that cannot be used"),
     Reason("CLOUD_UNIT", CloudError, "a point cloud in another unit than the map"),
     Reason("MESH_INVALID", MeshError, "a mesh that cannot be used"),
-    Reason("PANORAMA_INVALID", PanoramaError, "an image that is no panorama"),
+    Reason(
+        "PANORAMA_INVALID",
+        PanoramaError,
+        "an image that is no panorama, or no photograph of its camera",
+    ),
     Reason("MAP_FILE_INVALID", MapFileError, "a map file that is damaged or of an unknown format"),
     Reason("ID_INVALID", InputError, "an id that cannot name a resource"),
     Reason("NAME_INVALID", InputError, "a text that is no resource name"),

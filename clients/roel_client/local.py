@@ -395,6 +395,7 @@ def localize_panoramas(
     prior: str | None,
     config: LocalizeConfig,
     overlay: Path | None,
+    camera: str | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Locate panoramas in one of a few maps; for each the keys of `roel localize`.
 
@@ -407,19 +408,27 @@ def localize_panoramas(
         prior: file with the first T_world_panorama, for the default alone.
         config: parameters of the default, and of the verdict.
         overlay: folder to make, for one picture each.
+        camera: file with the camera of photographs, which need a prior; None for panoramas.
     """
-    from roel_service.io.images import read_panorama
+    from roel_service.io.camera import read_camera
+    from roel_service.io.images import read_panorama, read_photograph
     from roel_service.io.transforms import read_transform
 
     line_maps = [_read_map(name) for name in names]
     T_prior = None if prior is None else read_transform(Path(prior))
+    lens = None if camera is None else read_camera(Path(camera))
+
+    def read(picture_name: str) -> Array:
+        path = Path(picture_name)
+        return read_panorama(path) if lens is None else read_photograph(path, lens)
+
     for panorama_name in panorama_names:
-        read_panorama(Path(panorama_name))
-    locate = _locator(method, line_maps, T_prior, config)
+        read(panorama_name)
+    locate = _locator(method, line_maps, T_prior, lens, config)
     if overlay is not None:
         overlay.mkdir()
     for index, panorama_name in enumerate(panorama_names):
-        grey = read_panorama(Path(panorama_name))
+        grey = read(panorama_name)
         started_s = time.perf_counter()
         result = locate(grey)
         seconds = time.perf_counter() - started_s
@@ -429,16 +438,22 @@ def localize_panoramas(
 
 
 def _locator(
-    method: str, line_maps: list[LineMap], T_prior: SE3 | None, config: LocalizeConfig
+    method: str,
+    line_maps: list[LineMap],
+    T_prior: SE3 | None,
+    camera: Camera | None,
+    config: LocalizeConfig,
 ) -> Callable[[Array], PanoLocResult]:
-    """Prepare maps, and return what locates a grey panorama in them."""
+    """Prepare maps, and return what locates a grey panorama, or a photograph of a camera."""
     if method == "default":
         from roel_service.pano_loc.hints import PosePrior
-        from roel_service.pano_loc.localize import localize_panorama
+        from roel_service.pano_loc.localize import localize_panorama, localize_photograph
         from roel_service.pano_loc.prepare import prepare_map
 
         prior = None if T_prior is None else PosePrior(T_world_picture=T_prior)
         maps = [prepare_map(line_map, config) for line_map in line_maps]
+        if camera is not None and prior is not None:
+            return lambda grey: localize_photograph(grey, camera, maps, config, prior=prior)
         return lambda grey: localize_panorama(grey, maps, config, prior=prior)
 
     from roel_service.pano_loc.fgpl.parameters import VARIANTS

@@ -432,9 +432,10 @@ class LocalizeConfig(Stage, table="localize"):
         max_arc_count: longest lines of a panorama that are used.
         grid_step_m: spacing of the places that are tried first.
         max_rotation_count: orientations that are tried, best first.
-        candidate_count: poses refined in the first round.
+        candidate_count: poses whose neighbourhood is searched.
         max_hypothesis_count: poses at the most in an answer.
-        min_score: a pose that explains less of picture and map together is none.
+        min_score: a pose that explains less of picture and map together is none; a fifth of its
+            margin is added.
         min_coverage: nor is one at which the picture shows less of the map's lines.
         min_margin: a runner-up this close below the best pose, as a share of its score, leaves the
             answer open.
@@ -448,9 +449,9 @@ class LocalizeConfig(Stage, table="localize"):
     max_rotation_count: int = parameter(64, at_most(1000))
     candidate_count: int = parameter(72, at_most(1000))
     max_hypothesis_count: int = parameter(5, Rule("1 to 5", lambda value: 1 <= value <= 5))
-    min_score: float = parameter(0.33, SHARE)
-    min_coverage: float = parameter(0.4, SHARE)
-    min_margin: float = parameter(0.2, SHARE)
+    min_score: float = parameter(0.31, SHARE)
+    min_coverage: float = parameter(0.1, SHARE)
+    min_margin: float = parameter(0.12, SHARE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Pictures: equirectangular panoramas, as JPEG or PNG."""
+"""Pictures: equirectangular panoramas and photographs, as JPEG or PNG."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from roel_service.arrays import Array
 from roel_service.errors import PanoramaError
 from roel_service.io.files import read_input
+from roel_service.scene.camera import Camera
 
 MIN_HEIGHT_PX, MAX_HEIGHT_PX = 256, 8192
 # An uncompressed picture of the largest size, and then some.
@@ -39,14 +40,40 @@ def decode_panorama(data: bytes, subject: str = "panorama") -> Array:
     Raises:
         PanoramaError: neither JPEG nor PNG, another shape, or data that do not decode whole.
     """
-    import cv2
-
     width, height = _size(data, subject)
     if width != 2 * height or not MIN_HEIGHT_PX <= height <= MAX_HEIGHT_PX:
         expected = (
             f"a width of twice the height, and a height of {MIN_HEIGHT_PX} to {MAX_HEIGHT_PX}"
         )
         raise PanoramaError(subject, expected, f"{width} x {height}")
+    return _decoded(data, width, height, subject)
+
+
+def read_photograph(path: Path, camera: Camera) -> Array:
+    """(H, W) uint8 grey values of a photograph file; raises as `decode_photograph`."""
+    return decode_photograph(read_input(path, MAX_FILE_BYTES), camera, str(path))
+
+
+def decode_photograph(data: bytes, camera: Camera, subject: str = "photograph") -> Array:
+    """(H, W) uint8 grey values of an encoded photograph, as its camera took it.
+
+    Raises:
+        PanoramaError: neither JPEG nor PNG, another size than the camera's, or data that do not
+            decode whole.
+    """
+    width, height = _size(data, subject)
+    if (width, height) != (camera.width, camera.height):
+        expected = f"{camera.width} x {camera.height}, as its camera has"
+        raise PanoramaError(subject, expected, f"{width} x {height}")
+    if max(width, height) > 2 * MAX_HEIGHT_PX:
+        expected = f"sides of at most {2 * MAX_HEIGHT_PX}"
+        raise PanoramaError(subject, expected, f"{width} x {height}")
+    return _decoded(data, width, height, subject)
+
+
+def _decoded(data: bytes, width: int, height: int, subject: str) -> Array:
+    import cv2
+
     end = PNG_END if data.startswith(PNG_MAGIC) else JPEG_END
     # Decoders fill what is missing with grey; the end of the data is what a cut takes away.
     if end not in data[-4096:]:

@@ -1,4 +1,4 @@
-"""Straight edges of a panorama, as arcs of great circles.
+"""Straight edges of a picture, as arcs of great circles.
 
 A straight line in space is an arc of a great circle on the sphere of viewing rays, but a curve in
 the equirectangular picture. Lines are therefore looked for in overlapping perspective crops that
@@ -7,7 +7,7 @@ cover the sphere; their ends become rays, and from there on nothing knows of cro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import cv2
@@ -41,12 +41,15 @@ class PanoramaArcs:
         starts, ends: (A, 3) unit rays, panorama frame.
         normals: (A, 3) unit, along start x end.
         length_rad: (A,).
+        sides: (V, 3) unit; a ray is in the picture if it is on the positive side of each. None for
+            a panorama.
     """
 
     starts: FloatArray
     ends: FloatArray
     normals: FloatArray
     length_rad: FloatArray
+    sides: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
         count = len(self.length_rad)
@@ -55,6 +58,8 @@ class PanoramaArcs:
             object.__setattr__(self, name, array)
         length_rad = frozen_array(self.length_rad, np.float64, (count,), "length_rad")
         object.__setattr__(self, "length_rad", length_rad)
+        sides = frozen_array(self.sides, np.float64, (None, 3), "sides")
+        object.__setattr__(self, "sides", sides)
 
     def __len__(self) -> int:
         return len(self.length_rad)
@@ -74,7 +79,13 @@ class PanoramaArcs:
 
     def take(self, index: Array) -> PanoramaArcs:
         """The arcs of these indices, or of this mask, in that order."""
-        return PanoramaArcs(**{name: value[index] for name, value in vars(self).items()})
+        return replace(
+            self,
+            starts=self.starts[index],
+            ends=self.ends[index],
+            normals=self.normals[index],
+            length_rad=self.length_rad[index],
+        )
 
 
 def detect_arcs(grey: Array, config: LocalizeConfig) -> PanoramaArcs:
@@ -84,12 +95,21 @@ def detect_arcs(grey: Array, config: LocalizeConfig) -> PanoramaArcs:
     starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
     for crop in crops(grey.shape[1], config.crop_px):
         view = cv2.remap(padded, crop.column_px, crop.row_px, cv2.INTER_LINEAR)
-        lines = cv2.createLineSegmentDetector().detect(view)[0]
-        if lines is not None:
-            rays = crop.rays(lines.reshape(-1, 2, 2) - LSD_OFFSET_PX)
-            starts.append(rays[:, 0])
-            ends.append(rays[:, 1])
-    pieces = PanoramaArcs.between(np.concatenate(starts), np.concatenate(ends))
+        rays = crop.rays(detect_pieces(view))
+        starts.append(rays[:, 0])
+        ends.append(rays[:, 1])
+    return whole_arcs(np.concatenate(starts), np.concatenate(ends), config)
+
+
+def detect_pieces(view: Array) -> Array:
+    """(P, 2, 2) ends, px, of straight edges in a perspective view."""
+    lines = cv2.createLineSegmentDetector().detect(view)[0]
+    return np.empty((0, 2, 2)) if lines is None else lines.reshape(-1, 2, 2) - LSD_OFFSET_PX
+
+
+def whole_arcs(starts: FloatArray, ends: FloatArray, config: LocalizeConfig) -> PanoramaArcs:
+    """The longest of the lines that (P, 3) unit rays are the ends of pieces of."""
+    pieces = PanoramaArcs.between(starts, ends)
     arcs = join_arcs(pieces.take(pieces.length_rad >= MIN_PIECE_RAD))
     arcs = arcs.take(arcs.length_rad >= np.deg2rad(config.min_arc_deg))
     return arcs.take(np.arange(min(len(arcs), config.max_arc_count)))

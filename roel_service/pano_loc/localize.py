@@ -10,10 +10,12 @@ from roel_service.errors import InputError
 from roel_service.pano_loc.arcs import PanoramaArcs, detect_arcs
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
 from roel_service.pano_loc.orientation import rotation_hypotheses
+from roel_service.pano_loc.photograph import arcs_of_photograph
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import refine_poses
 from roel_service.pano_loc.search import coarse_candidates
 from roel_service.pano_loc.verdict import Found, enough_arcs, enough_lines, hypotheses, judge
+from roel_service.scene.camera import Camera
 from roel_service.scene.results import PanoLocResult
 
 
@@ -38,6 +40,32 @@ def localize_panorama(
         InputError: no map, or more than 8.
     """
     return localize_arcs(detect_arcs(grey, config), maps, config, prior=prior, gravity=gravity)
+
+
+def localize_photograph(
+    grey: Array,
+    camera: Camera,
+    maps: Sequence[PreparedMap],
+    config: LocalizeConfig,
+    *,
+    prior: PosePrior,
+    gravity: Gravity | None = None,
+) -> PanoLocResult:
+    """Where an (H, W) uint8 photograph was taken; the poses are `T_world_camera`.
+
+    Args:
+        grey: the picture.
+        camera: that took it, its axes right, down, forward.
+        maps: as in `localize_panorama`.
+        config: parameters, the same as the maps were prepared with.
+        prior: first T_world_camera: a photograph shows too little to be looked for everywhere.
+        gravity: which way is up; `up_picture` in the camera's axes.
+
+    Raises:
+        InputError: as `localize_panorama`, or a picture of another size than the camera's.
+    """
+    arcs = arcs_of_photograph(grey, camera, config)
+    return localize_arcs(arcs, maps, config, prior=prior, gravity=gravity)
 
 
 def localize_arcs(

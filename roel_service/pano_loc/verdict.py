@@ -35,6 +35,8 @@ from roel_service.scene.results import (
 
 # Fewer lines on either side hold no pose, whatever they are.
 MIN_ARC_COUNT, MIN_ARC_TOTAL_RAD = 20, np.deg2rad(150.0)
+# Photographs show less, and come with a prior.
+MIN_PHOTO_ARC_COUNT, MIN_PHOTO_ARC_TOTAL_RAD = 10, np.deg2rad(60.0)
 MIN_LINE_COUNT = 12
 # Poses farther apart than either of these are different answers; `FOUND` promises the same.
 SAME_ANSWER_M, SAME_ANSWER_RAD = 0.3, np.deg2rad(15.0)
@@ -43,6 +45,8 @@ MAX_SIGMA_M, MAX_SIGMA_RAD = 0.3, np.deg2rad(15.0)
 # Map lines may be hidden: their share counts half.
 COVERAGE_WEIGHT = 0.5
 POINT_SPACING_M = 0.1
+# A pose that stands out needs less of a score: where walls hide most of a map, scores are low.
+MARGIN_WEIGHT = 0.2
 # What nothing holds gets a variance of 1, rad^2 or m^2.
 WEAKEST = 1e-7
 # What maps built from events are off as a whole, which no residual shows.
@@ -65,7 +69,10 @@ class Found:
 
 def enough_arcs(arcs: PanoramaArcs) -> bool:
     """Whether a picture has the lines that an answer needs."""
-    return len(arcs) >= MIN_ARC_COUNT and bool(arcs.length_rad.sum() >= MIN_ARC_TOTAL_RAD)
+    count, total_rad = MIN_ARC_COUNT, MIN_ARC_TOTAL_RAD
+    if len(arcs.sides):
+        count, total_rad = MIN_PHOTO_ARC_COUNT, MIN_PHOTO_ARC_TOTAL_RAD
+    return len(arcs) >= count and bool(arcs.length_rad.sum() >= total_rad)
 
 
 def enough_lines(prepared: PreparedMap) -> bool:
@@ -119,7 +126,8 @@ def _reason(best: PoseHypothesis, margin: float, config: LocalizeConfig) -> NoPo
     """Why the best pose may not be relied on; None if it may."""
     sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])
     sigma_m = np.sqrt(np.linalg.eigvalsh(best.covariance[3:, 3:])[-1])
-    if best.score < config.min_score or best.explained_3d < config.min_coverage:
+    evidence = best.score + MARGIN_WEIGHT * margin
+    if evidence < config.min_score or best.explained_3d < config.min_coverage:
         return NoPoseReason.NOT_IN_MAP
     if sigma > MAX_SIGMA_RAD or sigma_m > MAX_SIGMA_M:
         return NoPoseReason.DEGENERATE
@@ -177,7 +185,8 @@ def covered(pose: SE3, arcs: PanoramaArcs, prepared: PreparedMap) -> float:
         SCORE_GATE_RAD,
     )
     along = dot(rays, directions)
-    weight = np.sqrt(np.maximum(0.0, 1.0 - along**2)) / distance_m
+    shown = ((rays @ pose.rotation) @ arcs.sides.T > 0.0).all(axis=1)
+    weight = shown * np.sqrt(np.maximum(0.0, 1.0 - along**2)) / distance_m
     fit = np.exp(-0.5 * (np.minimum(angle_rad, 1.0) / SCORE_WIDTH_RAD) ** 2)
     return float(weight @ fit / max(weight.sum(), 1e-9))
 

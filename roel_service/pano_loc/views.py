@@ -91,13 +91,14 @@ def views_from(lines: ClassedLines, places: FloatArray, bearing_count: int) -> V
     slots, words, kinds = views_kernels.views(
         lines.feet, lines.which, inside, bearing_count, SHELL_ENDS_M
     )
-    return Views(
-        slots=slots,
-        words=words,
-        kinds=kinds,
-        sizes=views_kernels.sizes(words, kinds, len(lines.frames) * len(SHELL_MIDDLES_M)),
-        bearing_count=bearing_count,
-    )
+    everything = np.full(len(lines.frames) * bearing_count, ~np.uint64(0))
+    sizes = _sizes(slots, words, kinds, everything, len(lines.frames))
+    return Views(slots=slots, words=words, kinds=kinds, sizes=sizes, bearing_count=bearing_count)
+
+
+def _sizes(slots: Array, words: Array, kinds: Array, shown: Array, class_count: int) -> FloatArray:
+    kind_count = class_count * len(SHELL_MIDDLES_M)
+    return np.asarray(views_kernels.sizes(slots, words, kinds, shown, kind_count))
 
 
 def widest(lines: ClassedLines, place: FloatArray, count: int) -> ClassedLines:
@@ -116,11 +117,13 @@ class Pane:
 
     Attributes:
         words: (K, B) uint64, painted elevations.
+        shown: (K, B) uint64, what the picture shows; None if it shows everything.
         share: (N,) chance that a step of each kind of line is painted.
         gain, loss: (N,) log-likelihood ratios of a step that is painted, and of one that is not.
     """
 
     words: Array
+    shown: Array | None
     share: FloatArray
     gain: FloatArray
     loss: FloatArray
@@ -139,12 +142,18 @@ def pane_of(
         DIRECTION_SLACK_RAD + 0.25 * step_m / SLACK_DISTANCE_M,
         bearing_count,
     )
-    share = np.maximum(views_kernels.painted_share(words), MIN_SHARE)[:, None]
+    shown = None
+    if len(arcs.sides):
+        shown = views_kernels.paint_view(arcs.sides @ rotation.T, frames, bearing_count)
+    everything = np.full_like(words, ~np.uint64(0))
+    painted = views_kernels.painted_share(words, everything if shown is None else shown)
+    share = np.maximum(painted, MIN_SHARE)[:, None]
     seen = SEEN_CHANCE * np.exp(-SHELL_MIDDLES_M / SEEN_REACH_M)
     gain = np.log((seen + (1.0 - seen) * share) / share)
     loss = np.broadcast_to(np.log(1.0 - seen), gain.shape)
     return Pane(
         words=words,
+        shown=shown,
         share=np.repeat(share[:, 0], len(seen)),
         gain=gain.ravel(),
         loss=loss.ravel(),
@@ -161,6 +170,16 @@ def agreement(views: Views, panes: Sequence[Pane]) -> FloatArray:
     )
     words = np.stack([pane.words.ravel() for pane in panes])
     total = views_kernels.painted_steps(views.slots, views.words, views.kinds, words, gain - loss)
-    size = np.maximum(views.sizes.sum(axis=1), 1.0)
-    excess = (total[:, :, 0] - share @ views.sizes.T) / np.sqrt(size)
-    return np.stack([excess, total[:, :, 1] + loss @ views.sizes.T], axis=2)
+    sizes = np.stack([_sizes_in(views, pane) for pane in panes])
+    size = np.maximum(sizes.sum(axis=2), 1.0)
+    excess = (total[:, :, 0] - np.einsum("rn,rtn->rt", share, sizes)) / np.sqrt(size)
+    ratio = total[:, :, 1] + np.einsum("rn,rtn->rt", loss, sizes)
+    return np.stack([excess, ratio], axis=2)
+
+
+def _sizes_in(views: Views, pane: Pane) -> FloatArray:
+    """(T, N) sizes of the parts of lines that a picture shows."""
+    if pane.shown is None:
+        return views.sizes
+    shown = pane.shown.ravel()
+    return _sizes(views.slots, views.words, views.kinds, shown, len(pane.words))

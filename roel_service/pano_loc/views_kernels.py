@@ -129,12 +129,12 @@ def views(
 
 
 @numba.njit(cache=True, nogil=True)
-def sizes(words: Array, kinds: Array, kind_count: int) -> FloatArray:
-    """(T, N) steps that the lines of each kind take up."""
+def sizes(slots: Array, words: Array, kinds: Array, shown: Array, kind_count: int) -> FloatArray:
+    """(T, N) steps that the lines of each kind take up, of those that (K B,) words show."""
     size = np.zeros((len(words), kind_count))
     for t in range(len(words)):
         for j in range(words.shape[1]):
-            size[t, kinds[t, j]] += np.float64(_count(words[t, j]))
+            size[t, kinds[t, j]] += np.float64(_count(words[t, j] & shown[slots[t, j]]))
     return size
 
 
@@ -190,13 +190,41 @@ def paint(
 
 
 @numba.njit(cache=True, nogil=True)
-def painted_share(pane: Array) -> FloatArray:
-    """(K,) share of each class's part of a pane that is painted."""
+def paint_view(sides: FloatArray, frames: FloatArray, bearing_count: int) -> Array:
+    """(K, B) uint64 pane of all that a photograph shows.
+
+    Args:
+        sides: (V, 3) unit, world; a ray is shown if it is on the positive side of each.
+        frames: (K, 3, 3) as in `paint`.
+        bearing_count: B.
+    """
+    pane = np.zeros((len(frames), bearing_count), np.uint64)
+    for k in range(len(frames)):
+        inside = sides @ frames[k].T
+        for b in range(bearing_count):
+            bearing = (b + 0.5) * (2.0 * np.pi / bearing_count)
+            for e in range(ELEVATION_BITS):
+                elevation = (e + 0.5) / BITS_PER_RAD - np.pi / 2
+                x, y = np.cos(elevation) * np.cos(bearing), np.cos(elevation) * np.sin(bearing)
+                z = np.sin(elevation)
+                shown = True
+                for v in range(len(inside)):
+                    shown &= inside[v, 0] * x + inside[v, 1] * y + inside[v, 2] * z > 0.0
+                if shown:
+                    pane[k, b] |= np.uint64(1) << np.uint64(e)
+    return pane
+
+
+@numba.njit(cache=True, nogil=True)
+def painted_share(pane: Array, shown: Array) -> FloatArray:
+    """(K,) share of what is shown of each class's part of a pane that is painted."""
     share = np.zeros(len(pane))
     for k in range(len(pane)):
+        whole = 0.0
         for b in range(pane.shape[1]):
-            share[k] += _count(pane[k, b])
-    share /= ELEVATION_BITS * pane.shape[1]
+            share[k] += _count(pane[k, b] & shown[k, b])
+            whole += _count(shown[k, b])
+        share[k] /= max(whole, 1.0)
     return share
 
 

@@ -14,13 +14,15 @@ import pytest
 from roel_client import local
 from roel_client.cli.localize import METHODS, localize
 from roel_client.cli.main import parser
+from roel_client.cli.parser import UsageError
 from roel_service.config.stages import LocalizeConfig
 from roel_service.errors import NoAnswerError
 from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
 from roel_service.geometry.se3 import SE3
+from roel_service.io.camera import read_camera
 from roel_service.io.maps import export_map
 from tests.pano_loc.rooms import OTHER_FURNITURE, OTHER_ROOM, map_of, pose, segments_of
-from tests.pano_loc.wireframe import wireframe_panorama
+from tests.pano_loc.wireframe import wireframe_panorama, wireframe_photograph
 
 ROEL = Path(sys.executable).with_name("roel")
 TRUTH = pose(1.7, 1.5, 1.4, 0.05, -0.1, 2.5)
@@ -133,6 +135,29 @@ def test_the_map_that_holds_the_place_is_named(folder, monkeypatch, capsys):
     assert set(found) == set(lost) == KEYS | {"map"}
     assert (found["status"], found["map"]) == ("FOUND", "map.npz")
     assert (lost["status"], lost["map"]) == ("NOT_FOUND", None)
+
+
+def test_photographs_need_their_camera_and_a_first_pose(folder, monkeypatch, capsys):
+    camera = {"width": 640, "height": 480, "fx": 420, "fy": 420, "cx": 319.5, "cy": 239.5}
+    (folder / "camera.json").write_text(
+        json.dumps(camera | {"model": "pinhole", "distortion": []}), encoding="utf-8"
+    )
+    ahead = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    truth = SE3(rotation=TRUTH.rotation @ ahead, translation=TRUTH.translation)
+    np.savetxt(folder / "T_camera.txt", truth.matrix())
+    photograph = wireframe_photograph(truth, segments_of(), read_camera(folder / "camera.json"))
+    cv2.imwrite(str(folder / "photo.png"), photograph)
+    monkeypatch.chdir(folder)
+    options = ["localize", "map.npz", "photo.png", "--camera", "camera.json", "--json"]
+    with pytest.raises(UsageError, match="--camera: expected a first pose"):
+        localize(parser().parse_args(options), {})
+    options += ["--prior", "T_camera.txt"]
+    with pytest.raises(UsageError, match="--server: expected panoramas"):
+        localize(parser().parse_args([*options, "--server", "localhost:1"]), {})
+    localize(parser().parse_args(options), {})
+    found = json.loads(capsys.readouterr().out)
+    estimate = SE3.from_matrix(np.array(found["T_world_panorama"]))
+    assert translation_errors_m(estimate, truth) < 0.05
 
 
 def test_a_prior_is_read_and_the_pose_printed_for_people(folder):

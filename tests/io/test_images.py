@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from roel_service.errors import InputError, PanoramaError
-from roel_service.io.images import decode_panorama, read_panorama
+from roel_service.io.images import decode_panorama, decode_photograph, read_panorama
+from roel_service.scene.camera import Camera
 
 
 def encoded(suffix, height=256, width=512):
@@ -63,3 +64,12 @@ def test_a_damaged_png_is_refused():
 def test_a_missing_file_is_an_input_error(tmp_path):
     with pytest.raises(InputError):
         read_panorama(tmp_path / "none.jpg")
+
+
+def test_a_photograph_has_the_size_of_its_camera():
+    camera = Camera(width=40, height=30, fx_px=30.0, fy_px=30.0, cx_px=20.0, cy_px=15.0)
+    data = cv2.imencode(".png", np.full((30, 40), 77, np.uint8))[1].tobytes()
+    np.testing.assert_array_equal(decode_photograph(data, camera), np.full((30, 40), 77))
+    other = cv2.imencode(".png", np.full((40, 30), 77, np.uint8))[1].tobytes()
+    with pytest.raises(PanoramaError, match="expected 40 x 30, as its camera has, found 30 x 40"):
+        decode_photograph(other, camera)

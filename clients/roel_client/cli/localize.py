@@ -30,7 +30,7 @@ def add_commands(subparsers: Subparsers) -> None:
     """Declare `localize`."""
     what = Command(
         run=localize,
-        inputs=("map", "more_maps", "panoramas", "prior", "config"),
+        inputs=("map", "more_maps", "panoramas", "prior", "camera", "config"),
         folders=("overlay",),
     )
     parser = command(subparsers, "localize", "find where panoramas were taken in a map", what)
@@ -53,6 +53,11 @@ def add_commands(subparsers: Subparsers) -> None:
         "--prior", metavar="T.txt", help="first T_world_panorama, within 1 m, 30 deg"
     )
     parser.add_argument(
+        "--camera",
+        metavar="FILE.json",
+        help="the camera of ordinary photographs, in place of panoramas; needs --prior",
+    )
+    parser.add_argument(
         "--preset",
         default="default",
         type=one_of(*METHODS),
@@ -71,6 +76,8 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
     from roel_client import local
 
     method = METHODS[options.preset]
+    if options.camera is not None:
+        require_for_photographs(options)
     for name in ("prior", "server"):
         if method != DEFAULT and getattr(options, name) is not None:
             raise UsageError("--preset", f"default, as there is --{name}", options.preset)
@@ -82,7 +89,9 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
         "overlay": staged.get("overlay"),
     }
     if options.server is None:
-        documents = local.localize_panoramas(maps, options.panoramas, method=method, **asked)
+        documents = local.localize_panoramas(
+            maps, options.panoramas, method=method, camera=options.camera, **asked
+        )
         report(documents, options)
         return
     server = {"server": options.server, "options": server_options(options)}
@@ -91,6 +100,15 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
         report(
             local.localize_panoramas_remotely(maps, options.panoramas, **asked, **server), options
         )
+
+
+def require_for_photographs(options: argparse.Namespace) -> None:
+    """Raise `UsageError` unless the options are those that photographs can be located with."""
+    if options.prior is None:
+        raise UsageError("--camera", "a first pose beside it (--prior)", "none")
+    for name in ("overlay", "server"):
+        if getattr(options, name) is not None:
+            raise UsageError(f"--{name}", "panoramas, not photographs (--camera)", "photographs")
 
 
 def report(documents: Iterable[dict[str, Any]], options: argparse.Namespace) -> None:
