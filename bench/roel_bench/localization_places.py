@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roel_bench.registration import TUNING_PLACES
+from roel_bench.registration_places import TUNING_PLACES
 from roel_service.arrays import Array, FloatArray
 from roel_service.errors import InputError
 from roel_service.geometry.se3 import SE3

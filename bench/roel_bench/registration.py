@@ -3,7 +3,7 @@
 The paper's protocol turns the start about yaw, pitch and roll one after the other, 10 degrees standard
 deviation each, and then shifts it by 2 cm; `wide` is any start up to 30 degrees and 0.3 m off; `heading`
 and `free` move the whole map anywhere, and ask for it without a first guess; `elsewhere` asks for it in
-the cloud of another place.
+the cloud of another place, and `partial` in 70 % of its own cloud.
 """
 
 from __future__ import annotations
@@ -19,38 +19,30 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from roel_bench.catalogue import TUNING_SEEDS
+from roel_bench.registration_methods import METHODS, Answer, Query, Target, is_available
+from roel_bench.registration_places import LARGE, ROOM, SYMMETRIC, Place, part_of
 from roel_bench.results import this_machine
+from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import InputError
 from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
 from roel_service.io.files import read_input, whole_file
 from roel_service.progress import Progress, ProgressCallback
-from roel_service.register.prepare import PreparedCloud, prepare_cloud
-from roel_service.register.register import register_map
-from roel_service.scene.clouds import PointCloud
-from roel_service.scene.lines import LineMap
+from roel_service.register.prepare import prepare_cloud
 from roel_service.scene.results import RegistrationResult
 
-FORMAT = "roel registration benchmark 1"
+FORMAT = "roel registration benchmark 2"
 MAX_BYTES = 64 << 20
 
 PAPER_SIGMA_RAD, PAPER_SIGMA_M = np.radians(10.0), 0.02
 WIDE_TURN_RAD, WIDE_SHIFT_M = np.radians(30.0), 0.3
 ANYWHERE_M = 3.0
 
-# Parameters were chosen by looking at these.
-TUNING_PLACES = ("room_11", "room_12", *(f"sim_{seed}" for seed in TUNING_SEEDS))
+# Share of the cloud that `partial` leaves, cut off across its longer side.
+PARTIAL_SHARE = 0.7
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Place:
-    """A map and the cloud of the same place, in one frame: the true transform is the identity."""
-
-    name: str
-    line_map: LineMap
-    cloud: PointCloud
-    is_tuning: bool
+# What counts as found by a search from nothing.
+FOUND_DEG, FOUND_MM = 5.0, 100.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,43 +50,72 @@ class Trial:
     """One registration.
 
     Attributes:
-        place, line_count, point_count, is_tuning: what was registered; points after thinning.
+        place, kind, line_count, point_count, is_tuning: what was registered; points after thinning.
         protocol, method, seed: how.
-        rotation_deg, translation_mm: errors.
-        verdict: as told.
-        seconds, prepare_seconds: of the registration, and of the cloud before.
+        rotation_deg, translation_mm: errors; of a place with a symmetry against the nearer of its
+            two right answers, and None where the truth is not known.
+        verdict: as told; empty where the method tells none.
+        is_listed: whether all right answers are the answer or among its alternatives.
+        nees: squared error against the information, a degree of freedom; None without one.
+        seconds, prepare_seconds: of the processor, for the registration and for the cloud before.
     """
 
     place: str
+    kind: str
     line_count: int
     point_count: int
     is_tuning: bool
     protocol: str
     method: str
     seed: int
-    rotation_deg: float
-    translation_mm: float
+    rotation_deg: float | None
+    translation_mm: float | None
     verdict: str
+    is_listed: bool
+    nees: float | None
     seconds: float
     prepare_seconds: float
+
+    @property
+    def key(self) -> tuple[str, str, str, int]:
+        """What tells trials apart."""
+        return self.place, self.protocol, self.method, self.seed
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """A way to begin: how many starts of which method, and what each start is."""
+    """A way to begin: how many starts of which method, on which kinds of places."""
 
     name: str
     method: str
     count: int
+    kinds: tuple[str, ...] = (ROOM,)
 
 
 PROTOCOLS = (
     Protocol(name="paper", method="auto", count=50),
     Protocol(name="paper", method="point", count=10),
+    Protocol(name="paper", method="plane", count=5),
+    Protocol(name="paper", method="open3d plane", count=5),
+    Protocol(name="paper", method="open3d gicp", count=3),
+    Protocol(name="paper", method="small_gicp", count=5),
     Protocol(name="wide", method="auto", count=50),
+    Protocol(name="wide", method="plane", count=5),
+    Protocol(name="wide", method="open3d plane", count=5),
+    Protocol(name="wide", method="open3d gicp", count=3),
+    Protocol(name="wide", method="small_gicp", count=5),
     Protocol(name="heading", method="global", count=20),
     Protocol(name="free", method="global", count=10),
+    Protocol(name="free", method="open3d fpfh ransac", count=5),
+    Protocol(name="free", method="open3d fpfh fgr", count=5),
     Protocol(name="elsewhere", method="global", count=2),
+    Protocol(name="partial", method="auto", count=10),
+    Protocol(name="paper", method="auto", count=20, kinds=(LARGE,)),
+    Protocol(name="paper", method="point", count=3, kinds=(LARGE,)),
+    Protocol(name="heading", method="global", count=5, kinds=(LARGE,)),
+    Protocol(name="free", method="global", count=3, kinds=(LARGE,)),
+    Protocol(name="heading", method="global", count=2, kinds=(SYMMETRIC,)),
+    Protocol(name="free", method="global", count=1, kinds=(SYMMETRIC,)),
 )
 
 
@@ -124,92 +145,183 @@ def anywhere(rng: np.random.Generator, *, upright: bool) -> SE3:
     return SE3(rotation=rotation, translation=rng.uniform(-ANYWHERE_M, ANYWHERE_M, 3))
 
 
+STARTS: dict[str, Callable[[np.random.Generator], SE3]] = {
+    "paper": paper_start,
+    "wide": wide_start,
+    "partial": wide_start,
+}
+
+
+class Clouds:
+    """Clouds prepared when they are first asked for, and the processor time it took."""
+
+    def __init__(self, places: Sequence[Place], config: RegisterConfig):
+        self._places = {place.name: place for place in places}
+        self._config = config
+        self._known: dict[tuple[str, bool], tuple[Target, float]] = {}
+
+    def of(self, name: str, *, is_partial: bool = False) -> tuple[Target, float]:
+        """The cloud of a place, or a part of it, and the seconds."""
+        if (name, is_partial) not in self._known:
+            cloud = self._places[name].cloud
+            cloud = part_of(cloud, PARTIAL_SHARE) if is_partial else cloud
+            began_s = time.process_time()
+            target = Target(cloud=prepare_cloud(cloud, self._config))
+            self._known[name, is_partial] = target, time.process_time() - began_s
+        return self._known[name, is_partial]
+
+    def elsewhere(self, name: str, index: int) -> str | None:
+        """The name of another room, if there are so many."""
+        others = [n for n, place in sorted(self._places.items()) if place.kind == ROOM]
+        if index >= len(others) - 1:
+            return None
+        return others[(others.index(name) + 1 + index) % len(others)]
+
+
 def run(
-    places: Sequence[Place], protocols: Sequence[Protocol], progress: ProgressCallback
+    places: Sequence[Place],
+    protocols: Sequence[Protocol],
+    progress: ProgressCallback,
+    *,
+    path: Path | None = None,
 ) -> dict[str, Any]:
-    """All trials of all places, as a document."""
-    config = RegisterConfig()
-    trials: list[Trial] = []
-    prepared: dict[str, tuple[PreparedCloud, float]] = {}
-    for place in places:
-        began_s = time.perf_counter()
-        cloud = prepare_cloud(place.cloud, config)
-        prepared[place.name] = cloud, time.perf_counter() - began_s
-    total = len(places) * sum(protocol.count for protocol in protocols)
-    for place in places:
-        for protocol in protocols:
-            for trial in _trials(place, protocol, prepared, config):
-                trials.append(trial)
-                progress(
-                    Progress(
-                        stage=f"{place.name} {protocol.name}",
-                        done_count=len(trials),
-                        total_count=total,
-                        fraction=len(trials) / total,
-                    )
-                )
+    """All trials of all places, as a document.
+
+    Args:
+        path: JSON file whose trials are not run again, and which keeps those that are.
+    """
+    document = _document(path)
+    known = {Trial(**trial).key for trial in document["trials"]}
+    clouds = Clouds(places, RegisterConfig())
+    cells = [
+        (place, protocol)
+        for place in places
+        for protocol in protocols
+        if place.kind in protocol.kinds and is_available(protocol.method)
+    ]
+    for index, (place, protocol) in enumerate(cells):
+        progress(
+            Progress(
+                stage=f"{place.name} {protocol.name} {protocol.method}",
+                done_count=index,
+                total_count=len(cells),
+                fraction=index / len(cells),
+            )
+        )
+        document["trials"] += [asdict(trial) for trial in _trials(place, protocol, clouds, known)]
+        if path is not None:
+            write_document(path, document)
+    return document
+
+
+def keep(trials: Sequence[Trial], path: Path) -> None:
+    """Put trials into a file, in place of those of the same kind."""
+    document = _document(path)
+    new = {trial.key for trial in trials}
+    kept = [trial for trial in document["trials"] if Trial(**trial).key not in new]
+    write_document(path, document | {"trials": kept + [asdict(trial) for trial in trials]})
+
+
+def _document(path: Path | None) -> dict[str, Any]:
+    """This machine, and the trials of a file if there is one."""
     here = this_machine()
     return {
         "format": FORMAT,
         "machine": here.machine,
         "versions": here.versions,
-        "trials": [asdict(trial) for trial in trials],
+        "trials": read_document(path)["trials"] if path and path.exists() else [],
     }
 
 
 def _trials(
-    place: Place,
-    protocol: Protocol,
-    prepared: dict[str, tuple[PreparedCloud, float]],
-    config: RegisterConfig,
+    place: Place, protocol: Protocol, clouds: Clouds, known: set[tuple[str, str, str, int]]
 ) -> Iterator[Trial]:
-    others = [name for name in prepared if name != place.name]
     for seed in range(protocol.count):
+        if (place.name, protocol.name, protocol.method, seed) in known:
+            continue
         rng = np.random.default_rng(seed)
-        name, T_true, T_init = place.name, SE3.identity(), None
+        name: str | None = place.name
+        T_moved, T_init = SE3.identity(), None
         if protocol.name in STARTS:
             T_init = STARTS[protocol.name](rng)
         else:
-            T_true = anywhere(rng, upright=protocol.name != "free")
+            T_moved = anywhere(rng, upright=protocol.name != "free")
         if protocol.name == "elsewhere":
-            if seed >= len(others):
-                return
-            at = sorted(prepared).index(place.name) + 1 + seed
-            name = sorted(prepared)[at % len(prepared)]
-        cloud, prepare_s = prepared[name]
-        line_map = place.line_map.transformed(T_true)
-        asked = dataclasses.replace(config, gravity_aligned=protocol.name != "free")
-        began_s = time.perf_counter()
-        result = register_map(line_map, cloud, asked, method=protocol.method, T_init=T_init)
-        seconds = time.perf_counter() - began_s
-        degrees, millimetres = errors(result, T_true)
-        yield Trial(
-            place=place.name,
-            line_count=len(line_map),
-            point_count=len(cloud.points),
-            is_tuning=place.is_tuning,
-            protocol=protocol.name,
-            method=protocol.method,
-            seed=seed,
-            rotation_deg=round(degrees, 5),
-            translation_mm=round(millimetres, 4),
-            verdict=result.verdict.value,
-            seconds=round(seconds, 4),
-            prepare_seconds=round(prepare_s, 3),
-        )
+            name = clouds.elsewhere(place.name, seed)
+        if name is not None:
+            prepared = clouds.of(name, is_partial=protocol.name == "partial")
+            yield _trial(place, protocol, seed, prepared, T_moved, T_init)
 
 
-STARTS: dict[str, Callable[[np.random.Generator], SE3]] = {
-    "paper": paper_start,
-    "wide": wide_start,
-}
+def _trial(
+    place: Place,
+    protocol: Protocol,
+    seed: int,
+    prepared: tuple[Target, float],
+    T_moved: SE3,
+    T_init: SE3 | None,
+) -> Trial:
+    """One registration of a map that was moved before."""
+    target, prepare_s = prepared
+    query = Query(
+        line_map=place.line_map.transformed(T_moved),
+        target=target,
+        T_init=T_init,
+        config=dataclasses.replace(RegisterConfig(), gravity_aligned=protocol.name != "free"),
+    )
+    began_s = time.process_time()
+    answer = METHODS[protocol.method](query)
+    seconds = time.process_time() - began_s
+    motions = [SE3.identity()] + ([place.symmetry] if place.symmetry else [])
+    rights = [motion @ T_moved.inverse() for motion in motions]
+    nearest = min(rights, key=lambda right: errors(answer.T_target_source, right))
+    degrees, millimetres = errors(answer.T_target_source, nearest)
+    return Trial(
+        place=place.name,
+        kind=place.kind,
+        line_count=len(place.line_map),
+        point_count=len(target.cloud.points),
+        is_tuning=place.is_tuning,
+        protocol=protocol.name,
+        method=protocol.method,
+        seed=seed,
+        rotation_deg=round(degrees, 5),
+        translation_mm=round(millimetres, 4),
+        verdict=answer.result.verdict.value if answer.result else "",
+        is_listed=all(is_listed(answer, right) for right in rights),
+        nees=_nees(answer.result, nearest) if answer.result else None,
+        seconds=round(seconds, 4),
+        prepare_seconds=round(prepare_s, 3),
+    )
 
 
-def errors(result: RegistrationResult, T_moved: SE3) -> tuple[float, float]:
-    """Rotation in degrees; shift of the frame's origin in mm, with any known motion undone."""
-    off = result.T_target_source @ T_moved
+def errors(found: SE3, right: SE3) -> tuple[float, float]:
+    """Rotation in degrees; shift of the source's origin, as it was before any motion, in mm."""
+    off = found @ right.inverse()
     degrees = float(np.degrees(rotation_angle(off.rotation)))
     return degrees, 1e3 * float(np.linalg.norm(off.translation))
+
+
+def is_found(degrees: float, millimetres: float) -> bool:
+    """Whether a search from nothing came to the right place."""
+    return degrees < FOUND_DEG and millimetres < FOUND_MM
+
+
+def is_listed(answer: Answer, right: SE3) -> bool:
+    """Whether a transform is the answer or one of its alternatives."""
+    told = [answer.T_target_source]
+    if answer.result is not None:
+        told += [other.T_target_source for other in answer.result.alternatives]
+    return any(is_found(*errors(T, right)) for T in told)
+
+
+def _nees(result: RegistrationResult, right: SE3) -> float | None:
+    """Squared error of (r, d) against the information, a degree of freedom."""
+    if result.information is None:
+        return None
+    turn = Rotation.from_matrix(result.T_target_source.rotation @ right.rotation.T).as_rotvec()
+    off: FloatArray = np.concatenate([turn, result.T_target_source.translation - right.translation])
+    return round(float(off @ result.information @ off) / 6.0, 4)
 
 
 def write_document(path: Path, document: dict[str, Any]) -> None:

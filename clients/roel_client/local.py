@@ -844,33 +844,54 @@ def bench_mapping(
 
 
 def bench_registration(
-    names: list[tuple[str, str]],
     path: Path,
     *,
+    rooms: list[tuple[str, str]],
+    has_large: bool,
+    symmetric_count: int,
+    scans: Path | None,
     max_count: int | None,
     progress: ProgressCallback,
 ) -> tuple[dict[str, Any], str]:
-    """Run the registration benchmark on pairs of map and cloud; its trials, and their page."""
+    """Run what the file does not hold of the registration benchmark; its trials, and their page.
+
+    Args:
+        path: JSON file, which an interrupted run goes on with.
+        rooms: pairs of map and cloud.
+        has_large: whether all rooms side by side are a place as well.
+        symmetric_count: rooms of boxes to make.
+        scans: folder of real scans.
+        max_count: trials of each kind at the most.
+    """
     from dataclasses import replace
 
-    from roel_bench import registration, registration_report
+    from roel_bench import (
+        registration,
+        registration_places,
+        registration_report,
+        registration_scans,
+    )
     from roel_service.io.clouds import read_cloud
 
     places = [
-        registration.Place(
+        registration_places.Place(
             name=Path(map_name).stem,
             line_map=_read_map(map_name),
             cloud=read_cloud(Path(cloud_name)),
-            is_tuning=Path(map_name).stem in registration.TUNING_PLACES,
+            is_tuning=Path(map_name).stem in registration_places.TUNING_PLACES,
         )
-        for map_name, cloud_name in names
+        for map_name, cloud_name in rooms
     ]
+    if has_large:
+        places.append(registration_places.side_by_side(places))
+    places += registration_places.symmetric_rooms(symmetric_count)
     protocols = [
         replace(protocol, count=min(protocol.count, max_count or protocol.count))
         for protocol in registration.PROTOCOLS
     ]
-    document = registration.run(places, protocols, progress)
-    registration.write_document(path, document)
+    if scans is not None:
+        registration.keep(registration_scans.run(scans), path)
+    document = registration.run(places, protocols, progress, path=path)
     return document, registration_report.document(document)
 
 

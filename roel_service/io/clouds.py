@@ -1,7 +1,7 @@
 """Meshes and points, told apart by content.
 
-Meshes and edges of the truth are NPZ or PLY. A cloud to register with is also PCD, LAS, text, or a
-mesh of any kind that trimesh reads, which is then sampled.
+Meshes and edges of the truth are NPZ or PLY. A cloud to register with is also PCD, LAS, LAZ, legacy VTK,
+text, or a mesh of any kind that trimesh reads, which is then sampled.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from roel_service.io.las import is_las, read_las
 from roel_service.io.npz import read_npz, write_npz
 from roel_service.io.pcd import read_pcd
 from roel_service.io.ply import read_ply
+from roel_service.io.vtk import is_vtk, read_vtk
 from roel_service.scene.clouds import PointCloud, TriangleMesh
 
 __all__ = ["read_cloud", "read_mesh", "read_points", "write_npz"]
@@ -60,7 +61,7 @@ def read_mesh(path: Path) -> TriangleMesh:
 
 
 def read_cloud(path: Path) -> PointCloud:
-    """Read a cloud: PLY, PCD, LAS, NPZ, text `x y z ...`, or a mesh, of which points are sampled.
+    """Read a cloud: PLY, PCD, LAS, LAZ, VTK, NPZ, text `x y z ...`, or a mesh, which is sampled.
 
     Raises:
         InputError: no readable file.
@@ -79,7 +80,8 @@ def _within_reach(cloud: PointCloud, subject: str) -> PointCloud:
     reach_m = float(np.abs(cloud.points).max())
     if reach_m > MAX_REACH_M:
         expected = f"points within {MAX_REACH_M:.0f} m of the origin (move the frame there)"
-        raise CloudError(subject, expected, f"{reach_m:.0f} m")
+        found = f"{reach_m:.0f} m; {reach_m / 1000:.0f} m if these are millimetres"
+        raise CloudError(subject, expected, found)
     return cloud
 
 
@@ -98,6 +100,8 @@ def _cloud_of_any_format(path: Path) -> PointCloud:
         return _cloud(*read_pcd(path), MIN_CLOUD_COUNT, subject)
     if is_las(head):
         return _cloud(read_las(path), None, MIN_CLOUD_COUNT, subject)
+    if is_vtk(head):
+        return _cloud(read_vtk(path), None, MIN_CLOUD_COUNT, subject)
     kind = _mesh_kind(head, path.stat().st_size)
     if kind is not None:
         return _sampled(_trimesh_triangles(path, kind), subject)
@@ -159,7 +163,7 @@ def _text_points(path: Path) -> Array:
     first, _, rest = data.partition(b"\n")
     if re.match(rb"[\"\sA-Za-z_,;]+$", first):  # the names of the columns
         data = rest
-    expected = "a cloud as PLY, PCD, LAS, NPZ, mesh or text `x y z`"
+    expected = "a cloud as PLY, PCD, LAS, LAZ, VTK, NPZ, mesh or text `x y z`"
     if not re.search(rb"\d", data):
         raise CloudError(str(path), expected, "no numbers")
     try:

@@ -1,7 +1,8 @@
-"""LAS, the exchange format of laser scans: positions alone, uncompressed."""
+"""LAS, the exchange format of laser scans: positions alone; compressed ones (LAZ) by laspy, extra `laz`."""
 
 from __future__ import annotations
 
+import io
 import struct
 from pathlib import Path
 
@@ -30,15 +31,16 @@ def read_las(path: Path) -> FloatArray:
 
     Raises:
         InputError: no readable file.
-        CloudError: compressed (LAZ), or shorter than its header claims.
+        CloudError: shorter than its header claims, or compressed (LAZ) and damaged, or the extra `laz`
+            is missing.
     """
-    subject, expected = str(path), "a LAS file, uncompressed"
+    subject, expected = str(path), "a LAS file"
     with open_input(path) as file:
         data = file.read()
     if len(data) < _HEADER_BYTES:
         raise CloudError(subject, expected, f"{len(data)} bytes")
     if data[_FORMAT] & _COMPRESSED:
-        raise CloudError(subject, expected, "compressed points (LAZ); laszip unpacks them")
+        return _unpacked(data, subject)
     (begin,) = struct.unpack_from("<I", data, _BEGIN)
     row_bytes, count = struct.unpack_from("<HI", data, _FORMAT + 1)
     if count == 0 and len(data) >= _HEADER_BYTES_1_4:
@@ -49,3 +51,17 @@ def read_las(path: Path) -> FloatArray:
     row = np.dtype({"names": ["xyz"], "formats": ["<3i4"], "itemsize": row_bytes})
     steps = np.frombuffer(data, row, count, begin)["xyz"].astype(np.float64)
     return np.asarray(steps * scale + offset)
+
+
+def _unpacked(data: bytes, subject: str) -> FloatArray:
+    """(N, 3) points of a compressed file."""
+    try:
+        import laspy
+    except ModuleNotFoundError as missing:
+        expected = "roel-service[laz] installed, to read compressed points (LAZ)"
+        raise CloudError(subject, expected, f"no {missing.name}") from missing
+    try:
+        cloud = laspy.read(io.BytesIO(data))
+    except (laspy.LaspyException, ValueError, EOFError, OSError, RuntimeError) as damage:
+        raise CloudError(subject, "a LAZ file", str(damage)[:200]) from damage
+    return np.asarray(cloud.xyz, dtype=np.float64)

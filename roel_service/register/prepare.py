@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
+from roel_service.errors import CloudError
 from roel_service.geometry.segments import sample_segments
 from roel_service.geometry.vectors import unit
 from roel_service.register.directions import dominant_directions
@@ -23,6 +24,8 @@ PATCH_CELLS, VOTING_CELLS = 2.0, 7.5
 ROOM_FOR_SOURCE = 1.0
 # A point this far from a plane, in distances between points, is none of it.
 PLANE_TOLERANCE = 0.6
+# Fewer points are no place.
+MIN_POINT_COUNT = 100
 # Points whose neighbours tell how dense a cloud is.
 DENSITY_SAMPLE_COUNT, NEIGHBOUR_COUNT = 2000, 8
 
@@ -60,7 +63,14 @@ def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
 
     The planes are fitted to cells as large as the distance of the points asks for, so that a sparse
     scan has some too.
+
+    Raises:
+        CloudError: fewer points than `MIN_POINT_COUNT`, or one that is not finite.
     """
+    if len(cloud) < MIN_POINT_COUNT:
+        raise CloudError("cloud", f"at least {MIN_POINT_COUNT} points", f"{len(cloud)}")
+    if not np.isfinite(cloud.points).all():
+        raise CloudError("cloud", "finite points", "NaN or infinity")
     points = thin(cloud.points.astype(np.float64), config.voxel_m)
     tree = cKDTree(points)
     resolution_m = max(config.voxel_m, _spacing(points, tree))

@@ -60,7 +60,8 @@ def register_map(
 
     Raises:
         NoAnswerError: fewer than three lines.
-        CloudError: a cloud in another unit than the map.
+        CloudError: a cloud in another unit than the map, of too few points, or with points that are
+            not finite.
     """
     moving = source_of_map(source) if isinstance(source, LineMap) else source_of_cloud(source)
     if not isinstance(target, PreparedCloud):

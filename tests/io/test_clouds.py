@@ -1,5 +1,6 @@
 import logging
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -153,16 +154,56 @@ def test_clouds_as_las(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "a.las").points, SCATTER, atol=0.0006)
 
 
+def test_compressed_points_ask_for_their_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    (tmp_path / "a.laz").write_bytes(las_file(SCATTER, format_=0x83))
+    with pytest.raises(CloudError, match=r"roel-service\[laz\] installed"):
+        read_cloud(tmp_path / "a.laz")
+
+
+def test_clouds_as_laz(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    cloud = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
+    cloud.header.scales = [1e-3, 1e-3, 1e-3]
+    cloud.xyz = SCATTER.astype(np.float64)
+    cloud.write(str(tmp_path / "a.laz"))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.laz").points, SCATTER, atol=0.0006)
+    (tmp_path / "a.laz").write_bytes((tmp_path / "a.laz").read_bytes()[:-40])
+    with pytest.raises(CloudError, match="a LAZ file"):
+        read_cloud(tmp_path / "a.laz")
+
+
+def vtk_file(points, encoding):
+    head = f"# vtk DataFile Version 3.0\ndata\n{encoding}\nDATASET POLYDATA\nPOINTS {len(points)} float\n"
+    tail = b"\nVERTICES 1 2\n1 0\n"
+    if encoding == "BINARY":
+        return head.encode() + points.astype(">f4").tobytes()
+    return head.encode() + b"\n".join(b"%r %r %r" % tuple(map(float, p)) for p in points) + tail
+
+
+@pytest.mark.parametrize("encoding", ["ASCII", "BINARY"])
+def test_clouds_as_vtk(tmp_path, encoding):
+    (tmp_path / "a.vtk").write_bytes(vtk_file(SCATTER, encoding))
+    np.testing.assert_allclose(read_cloud(tmp_path / "a.vtk").points, SCATTER, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("data", "found"),
     [
         (las_file(SCATTER)[:-1], "150 points in 3226 bytes"),
-        (las_file(SCATTER, format_=0x83), "compressed points (LAZ)"),
         (las_file(SCATTER)[:100], "100 bytes"),
-        (las_file(SCATTER + np.array([5e5, 0, 0])), "points within 20000 m of the origin"),
-        (b"no cloud at all\n", "PLY, PCD, LAS, NPZ, mesh or text"),
+        (las_file(SCATTER + np.array([5e5, 0, 0])), "500 m if these are millimetres"),
+        (b"no cloud at all\n", "PLY, PCD, LAS, LAZ, VTK, NPZ, mesh or text"),
         (b"1 2\n3 4\n", "at least the columns x y z"),
         (b"", "no numbers"),
+        (vtk_file(SCATTER, "BINARY")[:-1], "150 points in 1799 bytes"),
+        (
+            vtk_file(SCATTER, "ASCII").replace(b"POINTS 150", b"POINTS 170"),
+            "450 coordinates, not 510",
+        ),
+        (vtk_file(SCATTER, "ASCII").replace(b"POINTS", b"CELLS"), "no POINTS of float or double"),
+        (vtk_file(SCATTER, "ASCII").replace(b"ASCII", b"BASE64"), "the encoding 'BASE64'"),
+        (vtk_file(SCATTER, "ASCII").replace(b"POINTS 150", b"POINTS 9" + 15 * b"0"), "points in"),
         (b"1 2 3\n4 5 6\n7 8 9\n", "at least 100 finite points, found 3"),
         (b"OFF\n1 0 0\n0 0 0\n", "a mesh"),
     ],

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from roel_bench.registration_scans import CLOUDS
 from roel_service.config.stages import RegisterConfig
 from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
 from roel_service.io.clouds import read_cloud
@@ -41,3 +42,28 @@ def test_a_turned_room_is_found_without_a_guess_and_from_one(data_folder):
         T = register_map(source, target, config, **options).T_target_source
         yaw_deg = np.degrees(np.arctan2(T.rotation[1, 0], T.rotation[0, 0]))
         assert yaw_deg == pytest.approx(40.8, abs=0.3)
+
+
+def test_car_scans_are_registered_as_their_library_allows(data_folder):
+    names = ("car_cloud401.csv", "car_cloud400.csv")
+    (source, target), config = scans(data_folder, names, 0.05)
+    result = register_map(source, target, config)
+    table = (data_folder / "real" / "icp" / "carCloudList.csv").read_text().splitlines()[2]
+    true = np.array(table.split(",")[1:], np.float64).reshape(4, 4)
+    found = result.T_target_source
+    # The bounds of libpointmatcher's own tests: 0.1 rad, and 0.1 m of difference in length.
+    assert rotation_angle(found.rotation @ true[:3, :3].T) < 0.1
+    lengths = [np.linalg.norm(t) for t in (found.translation, true[:3, 3])]
+    assert abs(lengths[0] - lengths[1]) < 0.1
+    assert result.verdict is Verdict.ACCEPTED
+
+
+def test_clouds_of_vtk_are_registered_as_their_library_allows(data_folder):
+    names = ("cloud.00001.vtk", "cloud.00000.vtk")
+    (source, target), config = scans(data_folder, names, 0.05)
+    result = register_map(source, target, config)
+    ours = result.T_target_source @ source.points
+    theirs = SE3.from_matrix(CLOUDS) @ source.points
+    # The bound of libpointmatcher's own tests, against the outcome of its own ICP.
+    assert np.median(np.abs(ours - theirs)) < 0.05 * np.median(np.abs(ours))
+    assert result.verdict is Verdict.ACCEPTED

@@ -205,6 +205,14 @@ class TestProperties:
         result = register_map(room_map(), shuffled, CONFIG, T_init=NUDGE)
         np.testing.assert_allclose(result.T_target_source.matrix(), found.matrix(), atol=1e-6)
 
+    def test_points_beyond_the_gate_change_nothing(self, found):
+        points = room_cloud().points
+        # Farther from every surface than any pair reaches, and inside the box of the room.
+        far = np.array([2.0, 1.9, 1.9]) + np.random.default_rng(5).uniform(-0.1, 0.1, (50, 3))
+        with_far = PointCloud(points=np.concatenate([points, far.astype(np.float32)]))
+        result = register_map(room_map(), with_far, CONFIG, T_init=NUDGE)
+        np.testing.assert_allclose(result.T_target_source.matrix(), found.matrix(), atol=1e-6)
+
     def test_lines_beyond_the_gate_change_little(self, prepared, found):
         far = room_map().segments[:6] + np.array([0.0, 0.0, 9.0])
         segments = np.concatenate([room_map().segments, far])
@@ -222,6 +230,21 @@ class TestProperties:
         backward = register_map(there, prepared, CONFIG, T_init=(self.MOTION @ NUDGE).inverse())
         self.assert_same(forward.T_target_source @ backward.T_target_source, SE3.identity())
         self.assert_same(forward.T_target_source, self.MOTION)
+
+
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (np.empty((0, 3)), "at least 100 points, found 0"),
+        (np.eye(3), "at least 100 points, found 3"),
+        (np.full((200, 3), np.nan), "finite points, found NaN"),
+    ],
+    ids=["empty", "three points", "NaN"],
+)
+def test_what_is_no_place_is_refused(points, found):
+    with pytest.raises(CloudError, match=found) as caught:
+        register_map(room_map(), PointCloud(points=points), CONFIG)
+    assert caught.value.reason == "CLOUD_INVALID"
 
 
 def test_a_map_without_lines_has_no_answer(prepared):

@@ -82,13 +82,14 @@ def bench_mapping(options: argparse.Namespace, staged: Staged) -> None:
 
 
 def _add_registration(group: Subparsers) -> None:
-    what = Command(run=bench_registration, outputs=("out",))
+    # The file is no staged output: it keeps the trials of an interrupted run, for the next one.
+    what = Command(run=bench_registration)
     parser = command(group, "registration", "maps against clouds of their places", what)
     parser.add_argument(
         "--place",
         action="append",
         nargs=2,
-        required=True,
+        default=[],
         metavar=("MAP", "CLOUD"),
         help="a map and the cloud of the same place in the same frame; may be repeated",
     )
@@ -97,7 +98,22 @@ def _add_registration(group: Subparsers) -> None:
         required=True,
         type=suffixed(".json"),
         metavar="FILE.json",
-        help="every trial; roel_bench.registration_report makes the page of it",
+        help="every trial; what it holds is not run again",
+    )
+    parser.add_argument(
+        "--large",
+        action="store_true",
+        help="all places side by side too, cut to 2,500 lines and 400,000 points",
+    )
+    parser.add_argument(
+        "--symmetric",
+        type=integer(0, 1000),
+        default=0,
+        metavar="N",
+        help="so many symmetric rooms of boxes, made by chance",
+    )
+    parser.add_argument(
+        "--scans", metavar="DIR", help="folder of real scans with transforms between them"
     )
     parser.add_argument(
         "--trials", type=integer(1, 1000), metavar="N", help="at most so many of each kind"
@@ -111,8 +127,11 @@ def bench_registration(options: argparse.Namespace, staged: Staged) -> None:
 
     with progress_bar() as progress:
         document, text = local.bench_registration(
-            [(line_map, cloud) for line_map, cloud in options.place],
-            staged["out"],
+            Path(options.out),
+            rooms=[(line_map, cloud) for line_map, cloud in options.place],
+            has_large=options.large,
+            symmetric_count=options.symmetric,
+            scans=Path(options.scans) if options.scans else None,
             max_count=options.trials,
             progress=progress,
         )

@@ -23,7 +23,7 @@ def add_commands(subparsers: Subparsers) -> None:
     parser = command(subparsers, "register", "find where a map lies in a point cloud", what)
     parser.add_argument("map", metavar="MAP", help=".rlm file or exported .npz; the source")
     parser.add_argument(
-        "cloud", metavar="CLOUD", help="PLY, PCD, LAS, NPZ, text or a mesh; the target"
+        "cloud", metavar="CLOUD", help="PLY, PCD, LAS, LAZ, VTK, NPZ, text or a mesh; the target"
     )
     parser.add_argument("--init", metavar="T.txt", help="first T_target_source; default: identity")
     parser.add_argument(
