@@ -45,8 +45,7 @@ class Target:
     @cached_property
     def of_open3d(self) -> Any:
         """The thinned points with Open3D's normals and covariances."""
-        import open3d
-
+        open3d = _open3d()
         cloud = _open3d_cloud(self.cloud.points)
         cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOUR_COUNT))
         cloud.estimate_covariances(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOUR_COUNT))
@@ -90,9 +89,7 @@ def _ours(method: str) -> Method:
 
 def _open3d_icp(kind: str) -> Method:
     def register(query: Query) -> Answer:
-        import open3d
-
-        registration = open3d.pipelines.registration
+        registration = _open3d().pipelines.registration
         source = _open3d_cloud(_points(query))
         target = query.target.of_open3d
         T = (query.T_init or SE3.identity()).matrix()
@@ -117,15 +114,13 @@ def _open3d_icp(kind: str) -> Method:
 
 def _open3d_features(kind: str) -> Method:
     def register(query: Query) -> Answer:
-        import open3d
-
-        registration = open3d.pipelines.registration
+        registration = _open3d().pipelines.registration
         source = _open3d_cloud(_points(query)).voxel_down_sample(FEATURE_VOXEL_M)
         target = _open3d_cloud(query.target.cloud.points).voxel_down_sample(FEATURE_VOXEL_M)
         features = [_features(cloud) for cloud in (source, target)]
         gate_m = FEATURE_GATE * FEATURE_VOXEL_M
         if kind == "ransac":
-            open3d.utility.random.seed(0)
+            _open3d().utility.random.seed(0)
             found = registration.registration_ransac_based_on_feature_matching(
                 source,
                 target,
@@ -147,8 +142,7 @@ def _open3d_features(kind: str) -> Method:
             found = registration.registration_fgr_based_on_feature_matching(
                 source, target, *features, option
             )
-        refined = _open3d_icp("plane")(replace(query, T_init=_rigid(found.transformation)))
-        return refined
+        return _open3d_icp("plane")(replace(query, T_init=_rigid(found.transformation)))
 
     return register
 
@@ -196,14 +190,20 @@ def _points(query: Query) -> FloatArray:
     return sample_segments(query.line_map.segments, SPACING_M)[0]
 
 
-def _open3d_cloud(points: FloatArray) -> Any:
+def _open3d() -> Any:
+    """Open3D, loaded when it is needed; untyped, since its stubs lack what it overloads."""
     import open3d
 
+    return open3d
+
+
+def _open3d_cloud(points: FloatArray) -> Any:
+    open3d = _open3d()
     return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
 
 
 def _features(cloud: Any) -> Any:
-    import open3d
+    open3d = _open3d()
 
     def neighbours(reach: float) -> Any:
         return open3d.geometry.KDTreeSearchParamHybrid(

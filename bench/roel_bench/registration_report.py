@@ -78,8 +78,8 @@ whose reference is the outcome of its own ICP, a median shift of 5 % of the medi
 is 2.5 %.
 """
 
-HEADINGS = ("protocol", "method", "place", "lines", "points", "trials", "median, deg", "median, mm")
-HEADINGS += ("mean, deg", "mean, mm", "near", "found", "seconds, median", "prepared in, s")
+HEADINGS = ["protocol", "method", "place", "lines", "points", "trials", "median, deg", "median, mm"]
+HEADINGS += ["mean, deg", "mean, mm", "near", "found", "seconds, median", "prepared in, s"]
 
 Trials = list[dict[str, Any]]
 
@@ -128,7 +128,7 @@ def _errors_table(trials: Trials, protocols: tuple[str, ...] = ()) -> str:
         report = [trial for trial in group if not trial["is_tuning"]]
         if report:
             lines.append([protocol, method, "**all without \\***", *_cells(report)])
-    return table(list(HEADINGS), lines)
+    return table(HEADINGS, lines)
 
 
 def _rank(key: tuple[Any, ...], order: Sequence[str]) -> tuple[int, bool]:
