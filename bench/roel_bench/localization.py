@@ -123,6 +123,21 @@ class Protocol:
     has_prior: bool = False
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Question:
+    """What a cell answers: panoramas, asked of a place in a way by a method."""
+
+    place: Place
+    protocol: Protocol
+    method: Method
+    asked: tuple[Panorama, ...]
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """That of the cell."""
+        return self.place.name, self.protocol.name, self.method.name
+
+
 def _yaw(degrees: float) -> tuple[SE3, ...]:
     turn = rotation_from_vector(np.array([0.0, 0.0, np.radians(degrees)]))
     return (SE3(rotation=turn, translation=np.zeros(3)),)
@@ -220,7 +235,7 @@ def run(
     *,
     again: bool = False,
 ) -> Results:
-    """Run the cells that the file does not hold yet, and write each as soon as it is known.
+    """Run the cells that the file does not hold, or of fewer panoramas; write each once it is known.
 
     Args:
         path: JSON file of an interrupted run, or a new one.
@@ -232,54 +247,68 @@ def run(
     here = this_machine()
     results = read_results(path) if path.exists() else Results(machine={}, versions={})
     results = Results(machine=here.machine, versions=here.versions, cells=results.cells)
-    known = set() if again else {cell.key for cell in results.cells}
+    known = {} if again else {cell.key: len(cell.trials) for cell in results.cells}
     wanted = [
-        (place, protocol, method)
-        for place in places
-        for protocol in protocols
-        for method in methods
-        if place.kind in (protocol.kinds or (place.kind,))
-        and method.name in (protocol.methods or (method.name,))
-        and (place.name, protocol.name, method.name) not in known
+        question
+        for question in _questions(places, protocols, methods)
+        if len(question.asked) > known.get(question.key, 0)
     ]
     warm: set[str] = set()
-    for index, (place, protocol, method) in enumerate(wanted):
+    for index, question in enumerate(wanted):
         progress(
             Progress(
-                stage=f"{place.name} {protocol.name} {method.name}",
+                stage=" ".join(question.key),
                 done_count=index,
                 total_count=len(wanted),
                 fraction=index / len(wanted),
             )
         )
-        if asked := _asked(place, protocol, places):
-            if method.name not in warm:
-                # What a method compiles at its first query is not timed.
-                method.prepare(place.line_map)(asked[0].read(), None)
-                warm.add(method.name)
-            results = results.with_cell(run_cell(place, protocol, method, asked))
-            write_results(path, results)
+        if question.method.name not in warm:
+            # What a method compiles at its first query is not timed.
+            query = question.method.prepare(question.place.line_map)
+            query(question.asked[0].read(), None)
+            warm.add(question.method.name)
+        results = results.with_cell(run_cell(question))
+        write_results(path, results)
     return results
 
 
-def _asked(place: Place, protocol: Protocol, places: Sequence[Place]) -> list[Panorama]:
-    """The panoramas to ask the map of a place for."""
+def _questions(
+    places: Sequence[Place], protocols: Sequence[Protocol], methods: Sequence[Method]
+) -> list[Question]:
+    """All that applies, place by place."""
+    return [
+        Question(
+            place=place, protocol=protocol, method=method, asked=_asked(place, protocol, places)
+        )
+        for place in places
+        for protocol in protocols
+        for method in methods
+        if place.kind in (protocol.kinds or (place.kind,))
+        and method.name in (protocol.methods or (method.name,))
+    ]
+
+
+def _asked(place: Place, protocol: Protocol, places: Sequence[Place]) -> tuple[Panorama, ...]:
+    """The panoramas to ask the map of a place for; none where there is no other room."""
     if protocol.name != ELSEWHERE:
-        return list(place.panoramas[: protocol.max_count])
+        return tuple(place.panoramas[: protocol.max_count])
     rooms = [other for other in places if other.kind == place.kind]
     at = [other.name for other in rooms].index(place.name)
     others = rooms[at + 1 :] + rooms[:at]
     if not others:
-        return []
+        return ()
     found = []
     for index in range(min(len(place.panoramas), protocol.max_count)):
         other = others[index % len(others)]
         found.append(other.panoramas[index % len(other.panoramas)])
-    return found
+    return tuple(found)
 
 
-def run_cell(place: Place, protocol: Protocol, method: Method, asked: Sequence[Panorama]) -> Cell:
+def run_cell(question: Question) -> Cell:
     """Ask for panoramas; each motion of the place is prepared once."""
+    place, protocol, method = question.place, question.protocol, question.method
+    asked = question.asked
     trials: dict[int, Trial] = {}
     prepare_seconds = []
     memory.reset_peak()

@@ -107,6 +107,14 @@ def test_what_a_file_holds_is_not_run_again(tmp_path):
     assert len(calls) - 2 * first == first + 1  # asked once more untimed, then once a place
 
 
+def test_cells_of_fewer_panoramas_are_run_again(tmp_path):
+    path = tmp_path / "r.json"
+    for max_count, expected in ((1, 1), (2, 2), (1, 2)):
+        protocol = Protocol(name="here", max_count=max_count)
+        done = run(PLACES[:1], [protocol], [oracle("default", [])], path, ignore)
+        assert len(done.cells[0].trials) == expected
+
+
 def test_another_files_results_are_refused(tmp_path):
     (tmp_path / "r.json").write_text('{"format": "another"}')
     with pytest.raises(InputError, match="expected roel localization benchmark 1"):
@@ -142,7 +150,7 @@ def test_a_trial_without_a_pose_is_not_right():
 def test_pictures_of_other_rooms_are_asked_for(results):
     # Both maps are asked for pictures of the other, which the names of panoramas do not tell here.
     asked = localization._asked(PLACES[0], Protocol(name="elsewhere"), PLACES)
-    assert asked == list(PLACES[1].panoramas)
+    assert asked == PLACES[1].panoramas
 
 
 def test_first_guesses_are_as_far_off_as_said():
