@@ -231,3 +231,8 @@ def test_cells_of_one_key_replace_each_other(tmp_path, results):
 def test_identity_is_the_only_motion_by_default():
     (motion,) = Protocol(name="here").motions
     np.testing.assert_array_equal(motion.matrix(), SE3.identity().matrix())
+
+
+def test_the_committed_page_is_that_of_the_committed_trials():
+    text = localization_report.DOCUMENT.read_text(encoding="utf-8")
+    assert localization_report.page(read_results(localization_report.RESULTS), text) == text
