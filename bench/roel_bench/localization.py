@@ -285,6 +285,7 @@ def _questions(
         for protocol in protocols
         for method in methods
         if place.kind in (protocol.kinds or (place.kind,))
+        and place.kind in (method.kinds or (place.kind,))
         and method.name in (protocol.methods or (method.name,))
     ]
 

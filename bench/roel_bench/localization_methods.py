@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from roel_bench.localization_places import HOUSE, HOUSE_OUTSIDE, HOUSE_ROOM
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
@@ -50,14 +51,15 @@ class Method:
 
     Attributes:
         prepare: what is done once for each map.
+        kinds: of the places that it is asked for; empty for all.
     """
 
     name: str
     prepare: Callable[[LineMap], Query]
+    kinds: tuple[str, ...] = ()
 
 
-def _prepare_default(line_map: LineMap) -> Query:
-    config = LocalizeConfig()
+def _prepare_default(line_map: LineMap, *, config: LocalizeConfig) -> Query:
     prepared = prepare_map(line_map, config)
 
     def query(grey: Array, prior: SE3 | None) -> Answer:
@@ -90,7 +92,21 @@ def _prepare_fgpl(line_map: LineMap, *, parameters: FgplParameters) -> Query:
     return query
 
 
-METHODS = {"default": Method(name="default", prepare=_prepare_default)} | {
-    name: Method(name=name, prepare=partial(_prepare_fgpl, parameters=parameters))
-    for name, parameters in VARIANTS.items()
+# Says its best pose where the default would say that there is none.
+UNJUDGED = LocalizeConfig(min_score=0.0, min_coverage=0.0)
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method(name="default", prepare=partial(_prepare_default, config=LocalizeConfig())),
+        Method(
+            name="default-unjudged",
+            prepare=partial(_prepare_default, config=UNJUDGED),
+            kinds=(HOUSE, HOUSE_ROOM, HOUSE_OUTSIDE),
+        ),
+        *(
+            Method(name=name, prepare=partial(_prepare_fgpl, parameters=parameters))
+            for name, parameters in VARIANTS.items()
+        ),
+    )
 }

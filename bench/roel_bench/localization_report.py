@@ -112,7 +112,7 @@ Rooms of boxes in pairs at half a turn from one another: two poses explain each 
 HOUSES = """\
 ZInD, one house, 12 photographs; the map is the layout of the house: edges of walls, doors and windows, no
 furniture. `house` searches all of it, `room` the lines of the room that the photograph was taken in; two photographs
-were taken where the layout has no lines.
+were taken where the layout has no lines. `default-unjudged` says its best pose whatever the score.
 """
 
 TIMES = """\

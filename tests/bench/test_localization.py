@@ -59,7 +59,8 @@ def oracle(name, calls):
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "localization.json"
-    methods = [oracle("default", []), oracle("fgpl", [])]
+    unjudged = dataclasses.replace(oracle("unjudged", []), kinds=(localization_places.HOUSE,))
+    methods = [oracle("default", []), oracle("fgpl", []), unjudged]
     done = run(
         PLACES, [p for p in localization.PROTOCOLS if p.change is None], methods, path, ignore
     )
@@ -94,6 +95,8 @@ def test_protocols_run_where_they_apply(results):
     assert ("house", "elsewhere", "default") not in keys
     assert ("twins", "here", "fgpl") in keys
     assert ("twins", "moved", "fgpl") not in keys
+    assert ("house", "here", "unjudged") in keys
+    assert ("room_11", "here", "unjudged") not in keys
 
 
 def test_what_a_file_holds_is_not_run_again(tmp_path):

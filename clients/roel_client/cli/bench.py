@@ -18,7 +18,7 @@ from roel_client.cli.parser import (
 )
 from roel_client.cli.staging import Staged
 
-LOCALIZATION_METHODS = ("default", "fgpl", "fgpl-released")
+LOCALIZATION_METHODS = ("default", "default-unjudged", "fgpl", "fgpl-released")
 LOCALIZATION_PROTOCOLS = (
     "here", "moved", "yaw_5", "yaw_17", "elsewhere", "prior", "width_512", "width_1024",
     "width_4096", "quality_10", "quality_30", "quality_50", "quality_70",
