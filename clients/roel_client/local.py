@@ -144,12 +144,14 @@ def refine_poses(
     map_name: str | None,
     config: Config,
     out: Path,
+    *,
+    estimate_time_offset: bool,
     progress: ProgressCallback,
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], Trajectory]:
     """Refine the poses of a recording, with its own lines or in a map, and write them.
 
     Returns:
-        What `roel refine-poses` prints.
+        What `roel refine-poses` prints, and the poses.
 
     Raises:
         NoAnswerError: too few lines.
@@ -166,10 +168,11 @@ def refine_poses(
             recording.camera,
             config,
             line_map=line_map,
+            estimate_time_offset=estimate_time_offset,
             progress=progress,
         )
     write_poses(trajectory, out)
-    return {**report, "seconds": time.perf_counter() - started_s}
+    return {**report, "seconds": time.perf_counter() - started_s}, trajectory
 
 
 def refine_poses_remotely(
@@ -181,7 +184,7 @@ def refine_poses_remotely(
     *,
     server: str,
     options: dict[str, Any],
-) -> dict[str, Any]:
+) -> tuple[dict[str, Any], Trajectory]:
     """Let a server refine the poses; as `refine_poses`.
 
     Args:
@@ -202,7 +205,8 @@ def refine_poses_remotely(
             recording.events, recording.trajectory, recording.camera, config, version, progress
         )
     write_poses(trajectory, out)
-    return {
+    has_sigma = answer.HasField("time_offset_sigma_us")
+    result = {
         "pose_count": answer.pose_count,
         "line_count": answer.line_count,
         "iterations": answer.iteration_count,
@@ -211,8 +215,23 @@ def refine_poses_remotely(
         "cost_final": answer.cost_final,
         "mean_shift_m": answer.mean_shift_m,
         "mean_turn_deg": answer.mean_turn_deg,
+        "time_offset_us": answer.time_offset_us,
+        "time_offset_sigma_us": answer.time_offset_sigma_us if has_sigma else None,
+        "problems": list(answer.problems),
         "seconds": time.perf_counter() - started_s,
     }
+    return result, trajectory
+
+
+def draw_poses(
+    recording: Recording, refined: Trajectory, truth_name: str | None, path: Path
+) -> None:
+    """Write the picture of given and refined poses, and of the true ones if there are any."""
+    from roel_service.evaluation import pose_figures
+    from roel_service.io.poses import read_trajectory
+
+    truth = None if truth_name is None else read_trajectory(Path(truth_name))
+    pose_figures.draw_trajectories(recording.trajectory, refined, truth, path)
 
 
 def read_map_file(name: str) -> MapFile:
@@ -893,6 +912,23 @@ def bench_registration(
         registration.keep(registration_scans.run(scans), path)
     document = registration.run(places, protocols, progress, path=path)
     return document, registration_report.document(document)
+
+
+def bench_poses(
+    path: Path,
+    *,
+    rooms: tuple[str, ...],
+    seed_count: int,
+    data: Path | None,
+    kept: Path,
+    progress: ProgressCallback,
+) -> tuple[dict[str, Any], str]:
+    """Run what the file does not hold of the benchmark of poses; all rows, and their page."""
+    from roel_bench import poses, poses_report
+    from roel_bench.catalogue import Places
+
+    results = poses.run(path, rooms, seed_count, Places(data=data, rooms=kept), progress)
+    return asdict(results), poses_report.document(results)
 
 
 def bench_localization(

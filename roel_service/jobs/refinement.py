@@ -34,6 +34,7 @@ def refine_poses(
     config: Config,
     *,
     line_map: LineMap | None = None,
+    estimate_time_offset: bool = False,
     progress: ProgressCallback = ignore,
 ) -> tuple[Trajectory, dict[str, Any]]:
     """Refined poses, and how that went with the keys that `roel refine-poses` prints.
@@ -44,7 +45,13 @@ def refine_poses(
     """
     started_s = time.perf_counter()
     found = poses.refine_poses(
-        events, trajectory, camera, config, line_map=line_map, progress=progress
+        events,
+        trajectory,
+        camera,
+        config,
+        line_map=line_map,
+        estimate_time_offset=estimate_time_offset,
+        progress=progress,
     )
     return found.trajectory, _report(found, trajectory, time.perf_counter() - started_s)
 
@@ -82,6 +89,7 @@ def _report(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, A
     before, after = given.T_world_camera, found.trajectory.T_world_camera
     shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
     turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
+    sigma_us = found.report.time_offset_sigma_us
     return {
         "pose_count": len(found.trajectory),
         "line_count": found.report.line_count,
@@ -91,5 +99,8 @@ def _report(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, A
         "cost_final": found.report.cost_final,
         "mean_shift_m": float(shift_m.mean()),
         "mean_turn_deg": float(np.degrees(turn_rad).mean()),
+        "time_offset_us": found.report.time_offset_us,
+        "time_offset_sigma_us": sigma_us if np.isfinite(sigma_us) else None,
+        "problems": [problem.value for problem in found.report.problems],
         "seconds": seconds,
     }

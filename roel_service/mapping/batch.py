@@ -25,7 +25,6 @@ from roel_service.mapping.front_end import Detected
 from roel_service.mapping.refine import (
     DAMPING_AFTER_FAILURE,
     DAMPING_AFTER_SUCCESS,
-    FIRST_DAMPING,
     OrthonormalLines,
     Refined,
 )
@@ -38,8 +37,9 @@ MAX_UNKNOWN_COUNT = 8192
 MAX_TRIAL_COUNT = 8
 # A step that lowers the cost by less than this share ends the iteration.
 CONVERGED_SHARE = 1e-6
-# Keeps the system regular along what nothing tells, as a share of its largest diagonal element.
-RIDGE_SHARE = 1e-14
+# Damping relative to the diagonal: at first, and at least, which keeps the system regular along what
+# nothing tells.
+FIRST_DAMPING, LEAST_DAMPING = 1e-3, 1e-9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -131,7 +131,7 @@ def refine_batch(refined: Refined, detected: Detected, config: RefineConfig) -> 
             converged = True
             break
         state = trial
-        damping *= DAMPING_AFTER_SUCCESS
+        damping = max(LEAST_DAMPING, damping * DAMPING_AFTER_SUCCESS)
         costs.append(cost)
         if costs[-2] - cost <= CONVERGED_SHARE * max(weighted_cost, cost):
             converged = True
@@ -281,11 +281,12 @@ class _Problem:
         self, state: _State, gradient: FloatArray, hessian: FloatArray, damping: float
     ) -> _State:
         """One damped step of everything."""
-        damped = hessian.copy()
-        diagonal = np.diagonal(hessian)
-        at = np.diag_indices_from(damped)
-        damped[at] += damping * diagonal + RIDGE_SHARE * diagonal.max()
-        delta = -linalg.solve(damped, gradient, assume_a="pos")
+        # In units in which every diagonal element is one: radians and metres do not compare.
+        size = np.sqrt(np.diagonal(hessian))
+        size[size == 0.0] = 1.0
+        damped = hessian / np.outer(size, size)
+        damped[np.diag_indices_from(damped)] += damping
+        delta = -linalg.solve(damped, gradient / size, assume_a="pos") / size
         by_line = delta[: 4 * self.line_count].reshape(-1, 4)
         by_pose = delta[4 * self.line_count :].reshape(-1, 6)
         U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, by_line)

@@ -7,7 +7,8 @@ too poor for the right matches get better ones.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import logging
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,17 +26,21 @@ from roel_service.mapping.joint import JointlyRefined, refine_jointly
 from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
+from roel_service.mapping.pose_jumps import pose_jumps
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.smooth_poses import smoothed
+from roel_service.mapping.time_offset import TimeOffset, time_offset
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.views import views_of
-from roel_service.progress import ProgressCallback, ignore
+from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.lines import InfiniteLines, LineMap
-from roel_service.scene.results import PoseReport, PoseResult
+from roel_service.scene.results import MAPPING_STAGES, PoseProblem, PoseReport, PoseResult
 from roel_service.scene.trajectory import Trajectory
+
+logger = logging.getLogger(__name__)
 
 # Fewer lines than this do not hold six unknowns.
 MIN_LINE_COUNT = 6
@@ -44,9 +49,45 @@ MIN_LINE_COUNT = 6
 MAP_GATES = (4.0, 2.0)
 # While the gate is wide, residuals up to this share of it count in full.
 FULL_WEIGHT_SHARE = 1.0 / 3.0
+# A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
+LEAST_OFFSET_US, OFFSET_SIGMA_COUNT = 4_000.0, 4.0
+MAX_OFFSET_COUNT = 3
+# A drift that is learned to be so many times larger than expected is none of an odometry.
+FAR_FACTOR = 3.0
+PROBLEMS = {
+    PoseProblem.JUMPS: "the given poses jump",
+    PoseProblem.TIME_OFFSET: "their clock is not that of the events; it can be estimated",
+    PoseProblem.FAR_OFF: "they, or the calibration, are off by more than an odometry's drift",
+}
 # Beyond the first gate: what noisy poses add between two frames, and over a whole track.
 MATCH_MARGIN_PX = 0.5
 TRACK_MARGIN_PX = 1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Found:
+    """What one run over the events found.
+
+    Attributes:
+        given: the trajectory that was refined, on the clock of the events.
+        smooth: the same without jitter.
+        refined: lines with their tracks.
+        rounds: of matching and refinement.
+    """
+
+    given: Trajectory
+    smooth: Trajectory
+    refined: Refined
+    rounds: list[JointlyRefined]
+
+    @property
+    def last(self) -> JointlyRefined:
+        return self.rounds[-1]
+
+    @property
+    def time_offset(self) -> TimeOffset:
+        """That is still left."""
+        return time_offset(self.last, self.smooth)
 
 
 def refine_poses(
@@ -56,6 +97,7 @@ def refine_poses(
     config: Config,
     *,
     line_map: LineMap | None = None,
+    estimate_time_offset: bool = False,
     progress: ProgressCallback = ignore,
 ) -> PoseResult:
     """Refine the poses of a recording, together with the lines that it sees or in a given map.
@@ -64,11 +106,13 @@ def refine_poses(
     as large as they are.
 
     Args:
-        events: read once, front to back.
+        events: read front to back, again for every estimate of the time offset.
         trajectory: poses on the clock of the events.
         camera: calibration of the sensor.
         config: parameters of every stage; those of the poses are in `refine`.
         line_map: lines that stay as they are; the given poses are roughly those in its world.
+        estimate_time_offset: whether the clock of the poses may run beside that of the events; the
+            result is on the latter, at the times that were given.
         progress: called often; may raise `Cancelled`.
 
     Raises:
@@ -78,35 +122,101 @@ def refine_poses(
         NoAnswerError: too few lines.
         Cancelled: as raised by `progress`.
     """
-    run = MappingRun(progress)
-    counted = CountedEvents(events, trajectory)
-    correction = PoseCorrection.none(trajectory, config.refine.pose_interval_us)
-    smooth = smoothed(trajectory)
+    seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
+    applied_us = 0
+    count = MAX_OFFSET_COUNT if estimate_time_offset else 1
+    for index in range(count):
+        run = MappingRun(part_of(progress, index / count, (index + 1) / count), seconds=seconds)
+        given = Trajectory(
+            t_us=trajectory.t_us + applied_us, T_world_camera=trajectory.T_world_camera
+        )
+        found = _found(events, given, camera, config, line_map, run)
+        left = found.time_offset
+        if index + 1 == count or not left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT):
+            break
+        applied_us += round(left.offset_us)
+    report = _report(found, trajectory, config, applied_us, seconds)
+    for problem in report.problems:
+        logger.warning("poses: %s", PROBLEMS[problem])
+    return PoseResult(
+        trajectory=_at_given_times(found, trajectory, is_aligned=line_map is None),
+        covariance=_covariance(found.last, found.given),
+        report=report,
+    )
+
+
+def _found(
+    events: EventSource,
+    given: Trajectory,
+    camera: Camera,
+    config: Config,
+    line_map: LineMap | None,
+    run: MappingRun,
+) -> _Found:
+    """One run over the events."""
+    counted = CountedEvents(events, given)
+    correction = PoseCorrection.none(given, config.refine.pose_interval_us)
+    smooth = smoothed(given)
     detector = line_detector(config.detect)
     detected = lines_of_all_frames(counted, smooth, camera, config, detector, run)
     counted.check_coverage()
     if line_map is None:
-        refined, found = _with_own_lines(detected, smooth, correction, config, run)
+        refined, rounds = _with_own_lines(detected, smooth, correction, config, run)
     else:
-        refined, found = _in_map(line_map, detected, smooth, correction, config, run)
-    observation_count = len(refined.tracks.observation)
-    noise_px = config.refine.pose_noise_px
-    poses = found[-1].correction.trajectory(smooth).T_world_camera
-    if line_map is None:
+        refined, rounds = _in_map(line_map, detected, smooth, correction, config, run)
+    return _Found(given=given, smooth=smooth, refined=refined, rounds=rounds)
+
+
+def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) -> Trajectory:
+    """The refined poses, in the world of the given ones or of the map."""
+    poses = found.last.correction.trajectory(found.smooth).T_world_camera
+    if is_aligned:
         poses = align_poses(poses, trajectory.T_world_camera) @ poses
-    return PoseResult(
-        trajectory=Trajectory(t_us=trajectory.t_us, T_world_camera=poses),
-        covariance=_covariance(found[-1], trajectory),
-        report=PoseReport(
-            line_count=len(refined),
-            observation_count=observation_count,
-            iteration_count=sum(len(joint.costs) - 1 for joint in found),
-            converged=found[-1].converged,
-            cost_initial=found[0].costs[0] * noise_px**2 / max(1, observation_count),
-            cost_final=found[-1].costs[-1] * noise_px**2 / max(1, observation_count),
-            seconds=run.seconds,
-        ),
+    refined = Trajectory(t_us=found.given.t_us, T_world_camera=poses)
+    if found.given.t_us[0] == trajectory.t_us[0]:
+        return refined
+    # Poses that the other clock leaves without a time of their own stay at the ends.
+    times_us = np.clip(trajectory.t_us, refined.t_us[0], refined.t_us[-1])
+    return Trajectory(t_us=trajectory.t_us, T_world_camera=refined.interpolate(times_us))
+
+
+def _report(
+    found: _Found,
+    trajectory: Trajectory,
+    config: Config,
+    applied_us: int,
+    seconds: dict[str, float],
+) -> PoseReport:
+    rounds = found.rounds
+    observation_count = len(found.refined.tracks.observation)
+    px2 = config.refine.pose_noise_px**2 / max(1, observation_count)
+    left = found.time_offset
+    return PoseReport(
+        line_count=len(found.refined),
+        observation_count=observation_count,
+        iteration_count=sum(len(joint.costs) - 1 for joint in rounds),
+        converged=rounds[-1].converged,
+        cost_initial=rounds[0].costs[0] * px2,
+        cost_final=rounds[-1].costs[-1] * px2,
+        time_offset_us=applied_us + left.offset_us,
+        time_offset_sigma_us=left.sigma_us,
+        problems=_problems(found, left, trajectory, config),
+        seconds=seconds,
     )
+
+
+def _problems(
+    found: _Found, left: TimeOffset, trajectory: Trajectory, config: Config
+) -> tuple[PoseProblem, ...]:
+    """What is wrong with the given poses beyond an odometry's jitter and drift."""
+    expected, drift = Drift.configured(config.refine), found.last.drift
+    is_there = {
+        PoseProblem.JUMPS: bool(pose_jumps(trajectory).any()),
+        PoseProblem.TIME_OFFSET: left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT),
+        PoseProblem.FAR_OFF: drift.sigma_rad > FAR_FACTOR * expected.sigma_rad
+        or drift.sigma_m > FAR_FACTOR * expected.sigma_m,
+    }
+    return tuple(problem for problem, there in is_there.items() if there)
 
 
 def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined:

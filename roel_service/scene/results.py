@@ -137,6 +137,14 @@ class RegistrationResult:
         return self.stop_reason is StopReason.CONVERGED
 
 
+class PoseProblem(Enum):
+    """Why refined poses are not to be relied on, or what was wrong with those given."""
+
+    JUMPS = "JUMPS"  # the given poses jump
+    TIME_OFFSET = "TIME_OFFSET"  # their clock is not that of the events
+    FAR_OFF = "FAR_OFF"  # they, or the calibration, are off by far more than an odometry's
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseReport:
     """How poses were refined.
@@ -148,6 +156,9 @@ class PoseReport:
         converged: the last round ended because a step changed next to nothing.
         cost_initial, cost_final: mean squared distance of an observation in use, px^2, before the
             first and after the last step.
+        time_offset_us, time_offset_sigma_us: what has to be added to the times of the given poses,
+            and its standard deviation; infinite where nothing tells.
+        problems: what a caller should look at before the poses are used.
         seconds: wall-clock time of each stage.
     """
 
@@ -157,6 +168,9 @@ class PoseReport:
     converged: bool
     cost_initial: float
     cost_final: float
+    time_offset_us: float
+    time_offset_sigma_us: float
+    problems: tuple[PoseProblem, ...]
     seconds: dict[str, float]
 
 

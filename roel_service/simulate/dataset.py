@@ -22,9 +22,16 @@ from roel_service.io.poses import write_trajectory
 from roel_service.progress import Progress, ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream, concatenate
+from roel_service.scene.trajectory import Trajectory
 from roel_service.simulate.curved import curved_room
 from roel_service.simulate.meshes import scene_from_mesh
-from roel_service.simulate.motion import Motion, as_odometry, walk_around, walk_in_room
+from roel_service.simulate.motion import (
+    Motion,
+    as_odometry,
+    walk_around,
+    walk_in_room,
+    with_white_noise,
+)
 from roel_service.simulate.panoramas import render_panorama
 from roel_service.simulate.render import THREAD_COUNT, render, render_depth
 from roel_service.simulate.rooms import furnished_room, grid_cube
@@ -184,15 +191,22 @@ class _Recording:
     def write(self, folder: Path) -> int:
         camera = self.config.camera
         trajectory = self.motion.trajectory(self.duration_us)
-        noisy = as_odometry(trajectory, self.scale, self.rng["odometry"])
         write_trajectory(folder / "poses.txt", trajectory)
-        write_trajectory(folder / "poses_noisy.txt", noisy)
+        write_trajectory(folder / "poses_noisy.txt", self._noisy(trajectory))
         write_camera(folder / "camera.json", camera)
         counter = _Counter()
         write_events_hdf5(folder / "events.h5", counter.passing(self._events()))
         self._write_truth(folder, camera)
         self._write_panoramas(folder)
         return counter.count
+
+    def _noisy(self, trajectory: Trajectory) -> Trajectory:
+        """Poses as an odometry gives them; of the cube, with the noise of the paper's experiment."""
+        rng = self.rng["odometry"]
+        if not self.outside:
+            return as_odometry(trajectory, self.scale, rng)
+        poses = with_white_noise(trajectory.T_world_camera, 1.0, rng)
+        return Trajectory(t_us=trajectory.t_us, T_world_camera=poses)
 
     def _tell(self, stage: str, done_count: int, total_count: int) -> None:
         begins = (0.0, 0.8, 0.9, 0.93, 1.0)

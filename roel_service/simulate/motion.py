@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from roel_service.arrays import FloatArray, IntArray
 from roel_service.geometry.se3 import SE3, rotation_from_vector
@@ -28,6 +29,9 @@ POSE_INTERVAL_US = 5_000
 JITTER_M, JITTER_RAD = 0.0022, np.deg2rad(0.06)
 DRIFT_M, DRIFT_RAD = 0.0045, np.deg2rad(0.25)
 DRIFT_S = 1.5
+# Noise of the cube's poses, per axis: an error of 0.33 units in all, as in the paper, and turns that
+# move the picture as far as the shifts do.
+WHITE_SHIFT, WHITE_TURN_RAD = 0.192, np.deg2rad(0.44)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,4 +161,22 @@ def as_odometry(trajectory: Trajectory, scale: float, rng: np.random.Generator) 
         drift[i] = keep[i] * drift[i - 1] + np.sqrt(1 - keep[i] ** 2) * steps[i]
     return Trajectory(
         t_us=trajectory.t_us, T_world_camera=trajectory.T_world_camera.retract(jitter + drift)
+    )
+
+
+def with_white_noise(poses: SE3, scale: float, rng: np.random.Generator) -> SE3:
+    """Poses (N), each but the first off by itself, in its position and its Euler angles.
+
+    Args:
+        poses: true poses.
+        scale: of the position error, in units of the paper's cube.
+        rng: draws the error.
+    """
+    shifts = rng.normal(0.0, WHITE_SHIFT * scale, poses.translation.shape)
+    turns_rad = rng.normal(0.0, WHITE_TURN_RAD, poses.translation.shape)
+    shifts[0] = turns_rad[0] = 0.0
+    angles_rad = Rotation.from_matrix(poses.rotation).as_euler("xyz") + turns_rad
+    return SE3(
+        rotation=Rotation.from_euler("xyz", angles_rad).as_matrix(),
+        translation=poses.translation + shifts,
     )

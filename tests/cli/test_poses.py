@@ -31,6 +31,9 @@ KEYS = [
     "cost_final",
     "mean_shift_m",
     "mean_turn_deg",
+    "time_offset_us",
+    "time_offset_sigma_us",
+    "problems",
     "seconds",
 ]
 
@@ -67,7 +70,8 @@ def roel(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize("given", [(), ("--map", "map.npz")], ids=["own lines", "map"])
 def test_poses_are_written_at_their_own_times(folder: Path, given: tuple[str, ...]) -> None:
-    options = ("--out", "refined.txt", "--config", "small.toml", "--json")
+    pictures = ("--plot", "poses.png", "--truth", "poses.txt")
+    options = ("--out", "refined.txt", "--config", "small.toml", *pictures, "--json")
     done = roel(folder, "refine-poses", *INPUTS, *given, *options)
     assert (done.returncode, done.stderr) == (0, "")
     result = json.loads(done.stdout)
@@ -78,6 +82,7 @@ def test_poses_are_written_at_their_own_times(folder: Path, given: tuple[str, ..
     moved = refined.T_world_camera.translation - before.T_world_camera.translation
     assert result["mean_shift_m"] == pytest.approx(np.linalg.norm(moved, axis=1).mean(), rel=1e-6)
     assert result["cost_final"] < result["cost_initial"]
+    assert (folder / "poses.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_build_writes_the_poses_that_it_refined(folder: Path) -> None:
@@ -97,6 +102,13 @@ def test_poses_to_write_need_poses_to_refine(folder: Path) -> None:
     expected = "--poses-out: expected --refine-poses beside it"
     assert done.stderr.startswith(f"roel: error: {expected}")
     assert not (folder / "none.txt").exists()
+
+
+def test_a_server_does_not_estimate_time_offsets(folder: Path) -> None:
+    given = ("--out", "none.txt", "--estimate-time-offset", "--server", "localhost:1")
+    done = roel(folder, "refine-poses", *INPUTS, *given)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("roel: error: --estimate-time-offset: expected no --server")
 
 
 def test_poses_without_lines_have_no_answer(folder: Path) -> None:

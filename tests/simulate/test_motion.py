@@ -13,6 +13,7 @@ from roel_service.simulate.motion import (
     looking_along,
     walk_around,
     walk_in_room,
+    with_white_noise,
 )
 
 BOUNDS_M = np.array([[0.0, 0.0, 0.0], [4.6, 5.0, 2.7]])
@@ -124,3 +125,14 @@ def test_odometry_errs_by_millimetres_after_alignment():
     # 8.7 mm as above, less what the alignment takes of a slow drift; never below the jitter alone.
     assert np.sqrt(3) * JITTER_M < min(ates_m)
     assert max(ates_m) < 8.7e-3 * 1.4
+
+
+def test_poses_of_the_cube_err_by_a_third_of_a_unit():
+    true = walk_around(25.0, np.random.default_rng(0)).trajectory(6_000_000).T_world_camera
+    noisy = with_white_noise(true, 1.0, np.random.default_rng(1))
+    tangent = true.local(noisy)
+    assert not tangent[0].any()
+    error = np.sqrt(np.mean(np.sum(tangent[:, 3:] ** 2, axis=1)))
+    assert error == pytest.approx(0.3325, rel=0.05)
+    # Every pose is off by itself.
+    assert np.abs(np.mean(tangent[1:, 3] * tangent[:-1, 3])) < 0.1 * np.mean(tangent[:, 3] ** 2)

@@ -32,6 +32,7 @@ def add_commands(subparsers: Subparsers) -> None:
     _add_mapping(group)
     _add_registration(group)
     _add_localization(group)
+    _add_poses(group)
 
 
 def _add_mapping(group: Subparsers) -> None:
@@ -207,6 +208,56 @@ def bench_localization(options: argparse.Namespace, staged: Staged) -> None:
             methods=options.methods,
             max_count=options.trials,
             again=options.again,
+            progress=progress,
+        )
+    print_result(document, text.rstrip("\n"), as_json=options.json)
+
+
+def _add_poses(group: Subparsers) -> None:
+    # The file is no staged output: it keeps the rows of an interrupted run, for the next one.
+    what = Command(run=bench_poses)
+    parser = command(group, "poses", "refined poses of the paper's cube and of rooms", what)
+    parser.add_argument(
+        "--out",
+        required=True,
+        type=suffixed(".json"),
+        metavar="FILE.json",
+        help="rows; those that it holds are not run again; roel_bench.poses_report makes the page",
+    )
+    parser.add_argument(
+        "--scenes", nargs="*", default=("room_11", "room_12"), metavar="NAME", help="rooms"
+    )
+    parser.add_argument(
+        "--draws",
+        type=integer(0, 1000),
+        default=5,
+        metavar="N",
+        help="draws of noise for the cube; 0 leaves it out",
+    )
+    parser.add_argument(
+        "--data", metavar="DIR", help="folder of recordings; default: the environment's ROEL_DATA"
+    )
+    parser.add_argument(
+        "--rooms",
+        required=True,
+        metavar="DIR",
+        help="folder that keeps the simulated rooms and the cube",
+    )
+    parser.add_argument("--json", action="store_true", help="print all rows as JSON")
+
+
+def bench_poses(options: argparse.Namespace, staged: Staged) -> None:
+    """Run the benchmark of poses and print its page."""
+    from roel_client import local
+
+    data = options.data or os.environ.get("ROEL_DATA")
+    with progress_bar() as progress:
+        document, text = local.bench_poses(
+            Path(options.out),
+            rooms=tuple(options.scenes),
+            seed_count=options.draws,
+            data=Path(data) if data else None,
+            kept=Path(options.rooms),
             progress=progress,
         )
     print_result(document, text.rstrip("\n"), as_json=options.json)

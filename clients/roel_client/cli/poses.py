@@ -13,21 +13,36 @@ from roel_client.cli.configuration import (
 )
 from roel_client.cli.maps import add_recording_options
 from roel_client.cli.output import print_result, progress_bar
-from roel_client.cli.parser import Command, Subparsers, command
+from roel_client.cli.parser import Command, Subparsers, command, suffixed
 from roel_client.cli.process import interruptible
 from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
+from roel_service.errors import ConfigError
 
 
 def add_commands(subparsers: Subparsers) -> None:
     """Declare `refine-poses`."""
     what = Command(
-        run=refine_poses, inputs=("events", "poses", "camera", "map", "config"), outputs=("out",)
+        run=refine_poses,
+        inputs=("events", "poses", "camera", "map", "truth", "config"),
+        outputs=("out", "plot"),
     )
     parser = command(subparsers, "refine-poses", "make noisy camera poses better", what)
     add_recording_options(parser)
     parser.add_argument("--map", metavar="MAP.rlm", help="hold the poses to this map's lines")
     parser.add_argument("--out", required=True, metavar="POSES.txt", help="TUM text")
+    parser.add_argument(
+        "--estimate-time-offset",
+        action="store_true",
+        help="the clock of the poses may run beside that of the events; OUT is on the latter",
+    )
+    parser.add_argument(
+        "--plot",
+        type=suffixed(".png"),
+        metavar="FILE.png",
+        help="the given and the refined trajectory",
+    )
+    parser.add_argument("--truth", metavar="FILE", help="true poses, for the picture")
     add_config_options(parser)
     add_seed_option(parser)
     add_server_options(parser, required=False, what="let this server refine the poses")
@@ -38,17 +53,26 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Refine the poses of a recording, and write them at their own times."""
     from roel_client import local
 
+    if options.estimate_time_offset and options.server is not None:
+        raise ConfigError("--estimate-time-offset", "no --server beside it", "one")
     config = effective_config(options, seed_table(options))
     recording = local.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
         if options.server is None:
-            result = local.refine_poses(recording, options.map, config, staged["out"], progress)
+            result, refined = local.refine_poses(
+                recording,
+                options.map,
+                config,
+                staged["out"],
+                estimate_time_offset=options.estimate_time_offset,
+                progress=progress,
+            )
         else:
             # A signal must reach the client, which then ends the work on the server too.
             with interruptible():
-                result = local.refine_poses_remotely(
+                result, refined = local.refine_poses_remotely(
                     recording,
                     options.map,
                     config,
@@ -57,12 +81,15 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
                     server=options.server,
                     options=server_options(options),
                 )
+    if "plot" in staged:
+        local.draw_poses(recording, refined, options.truth, staged["plot"])
     print_result(result, _told(result, options.out), as_json=options.json)
 
 
 def _told(result: dict[str, Any], out: str) -> str:
+    problems = "".join(f"; {problem}" for problem in result["problems"])
     return (
         f"{out}: {result['pose_count']} poses moved by {1e3 * result['mean_shift_m']:.1f} mm and "
         f"{result['mean_turn_deg']:.2f} degrees in the mean, held by {result['line_count']} lines; "
-        f"{result['seconds']:.1f} s"
+        f"{result['seconds']:.1f} s{problems}"
     )

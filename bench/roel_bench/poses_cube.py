@@ -1,0 +1,146 @@
+"""The paper's cube: noisy poses against lines that were triangulated with true ones.
+
+As published, the pipeline of preset `paper` runs up to triangulation with true poses; then noise is put
+on positions and Euler angles, and each row refines lines and poses over the same tracks. The default
+gets the same noisy poses and the events, and finds its lines itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from roel_bench.scenes import Scene
+from roel_service.config.presets import preset
+from roel_service.config.stages import Config, RefineConfig
+from roel_service.errors import NoAnswerError
+from roel_service.evaluation.poses import trajectory_errors
+from roel_service.geometry.se3 import SE3
+from roel_service.mapping.batch import refine_batch
+from roel_service.mapping.detect import line_detector
+from roel_service.mapping.first_lines import matched_tracks, triangulated_lines
+from roel_service.mapping.front_end import Detected, lines_of_all_frames
+from roel_service.mapping.refine import Refined
+from roel_service.mapping.refine_poses import refine_poses
+from roel_service.mapping.run import CountedEvents, MappingRun
+from roel_service.mapping.views import views_of
+from roel_service.progress import ignore
+from roel_service.scene.trajectory import Trajectory
+from roel_service.simulate.motion import with_white_noise
+
+# The cube is a few metres of a room large, in units: lengths of the default are in metres.
+UNITS_PER_M = 10.0
+STEP_COUNT = 60
+
+PAPER = preset("paper").refine
+LIMAP = replace(PAPER, residual="reprojection", loss="cauchy", loss_scale_px=1.0, event_weight=0.0)
+# The paper's rows in the paper's order, then the other reading of its squared cost.
+METHODS: dict[str, RefineConfig | None] = {
+    "none": None,
+    "reprojection": LIMAP,
+    "line Grassmann": replace(PAPER, event_weight=0.0),
+    "line + event Grassmann": PAPER,
+    "line Grassmann, quartic": replace(PAPER, event_weight=0.0, loss="quartic"),
+    "line + event Grassmann, quartic": replace(PAPER, loss="quartic"),
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CubeRow:
+    """One refinement of the cube's poses.
+
+    Attributes:
+        method, seed: what was done, and what drew the noise.
+        frame_count, line_count: poses and lines that were refined.
+        ate_hundredths, sim3_hundredths: of a unit, after SE(3) and after Sim(3) alignment.
+        scale: of that alignment.
+        rotation_deg: root mean square.
+        seconds: processor time.
+    """
+
+    method: str
+    seed: int
+    frame_count: int
+    line_count: int
+    ate_hundredths: float
+    sim3_hundredths: float
+    scale: float
+    rotation_deg: float
+    seconds: float
+
+
+def cube_rows(scene: Scene, seeds: Iterable[int]) -> Iterator[CubeRow]:
+    """Every method with every seed."""
+    if scene.trajectory is None:
+        raise NoAnswerError("cube", "true poses", "none")
+    detected, refined = triangulated(scene, scene.trajectory)
+    true = detected.frames.T_world_camera
+    for seed in seeds:
+        noisy = with_white_noise(true, 1.0, np.random.default_rng(seed))
+        for method, config in METHODS.items():
+            began = time.process_time()
+            poses = noisy if config is None else _batch(detected, refined, noisy, config)
+            seconds = time.process_time() - began
+            yield _row(method, seed, detected, poses, len(refined), seconds, scene.trajectory)
+        began = time.process_time()
+        given = Trajectory(t_us=detected.frames.t_us, T_world_camera=noisy)
+        result = refine_poses(scene.events, given, scene.camera, default_config())
+        seconds = time.process_time() - began
+        found = result.trajectory.T_world_camera
+        lines = result.report.line_count
+        yield _row("default", seed, detected, found, lines, seconds, scene.trajectory)
+
+
+def default_config() -> Config:
+    """The default, in units of the cube."""
+    config = preset("default")
+    drift = replace(config.refine, pose_drift_m=UNITS_PER_M * config.refine.pose_drift_m)
+    return replace(config, refine=drift)
+
+
+def triangulated(scene: Scene, trajectory: Trajectory) -> tuple[Detected, Refined]:
+    """What preset `paper` detects and triangulates with true poses."""
+    config, run = preset("paper"), MappingRun(ignore)
+    counted = CountedEvents(scene.events, trajectory)
+    detector = line_detector(config.detect)
+    detected = lines_of_all_frames(counted, trajectory, scene.camera, config, detector, run)
+    tracks = matched_tracks(detected, config, None, None, run)
+    rng = np.random.default_rng(config.runtime.seed)
+    refined = triangulated_lines(tracks, detected.evidence, detected.frames, config, rng, run)
+    return detected, refined
+
+
+def _batch(detected: Detected, refined: Refined, noisy: SE3, config: RefineConfig) -> SE3:
+    frames = replace(detected.frames, T_world_camera=noisy)
+    views = views_of(detected.observations, frames)
+    moved = replace(detected, frames=frames, evidence=replace(detected.evidence, views=views))
+    config = replace(config, pose_iteration_count=STEP_COUNT)
+    return refine_batch(refined, moved, config).T_world_camera
+
+
+def _row(
+    method: str,
+    seed: int,
+    detected: Detected,
+    poses: SE3,
+    line_count: int,
+    seconds: float,
+    truth: Trajectory,
+) -> CubeRow:
+    estimate = Trajectory(t_us=detected.frames.t_us, T_world_camera=poses)
+    errors = trajectory_errors(estimate, truth)
+    scaled = trajectory_errors(estimate, truth, with_scale=True)
+    return CubeRow(
+        method=method,
+        seed=seed,
+        frame_count=len(poses.translation),
+        line_count=line_count,
+        ate_hundredths=100.0 * errors.ate_rmse_m,
+        sim3_hundredths=100.0 * scaled.ate_rmse_m,
+        scale=scaled.scale,
+        rotation_deg=errors.rotation_rms_deg,
+        seconds=seconds,
+    )
