@@ -60,15 +60,16 @@ def time_offset(joint: JointlyRefined, trajectory: Trajectory) -> TimeOffset:
 
 def control_times_us(correction: PoseCorrection) -> FloatArray:
     """(K,) times at which control points weigh most."""
-    return correction.first_us + (np.arange(len(correction)) - 1.0) * correction.interval_us
+    steps = np.arange(len(correction), dtype=np.float64) - 1.0
+    return np.asarray(correction.first_us + steps * correction.interval_us)
 
 
 def velocities(trajectory: Trajectory, t_us: FloatArray | IntArray) -> FloatArray:
     """(n, 6) turns in rad/s and speeds in m/s at (n,) times, world; those of the ends beyond them."""
     first_us, last_us = int(trajectory.t_us[0]), int(trajectory.t_us[-1])
     span_us = min(SPAN_US, last_us - first_us)
-    begin_us = np.clip(np.asarray(t_us) - span_us // 2, first_us, last_us - span_us)
-    begin_us = begin_us.astype(np.int64)
+    middle_us = np.asarray(t_us).astype(np.int64)
+    begin_us = np.clip(middle_us - span_us // 2, first_us, last_us - span_us)
     before, after = trajectory.interpolate(begin_us), trajectory.interpolate(begin_us + span_us)
     turn = vector_from_rotation(after.rotation @ np.swapaxes(before.rotation, -1, -2))
     step = np.concatenate([turn, after.translation - before.translation], axis=-1)

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from roel_service.errors import Cancelled, LimitError, NoAnswerError
-from roel_service.evaluation.poses import trajectory_errors
+from roel_service.evaluation.poses import trajectory_errors, translation_errors_m
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.scene.lines import LineMap
+from roel_service.scene.results import PoseProblem
 from roel_service.scene.trajectory import Trajectory
 
 from .synthetic import CAMERA, SEGMENTS_WORLD, event_stream, trajectory
@@ -85,6 +86,36 @@ class TestTogetherWithTheLines:
         np.testing.assert_array_equal(built.line_map.segments, again.line_map.segments)
         assert fractions == sorted(fractions)
         assert built.report.seconds["refine"] > again.report.seconds["refine"]
+
+
+class TestAClockThatIsOff:
+    """Poses that are stamped 30 ms late."""
+
+    @pytest.mark.parametrize("estimate", [False, True])
+    def test_it_is_told_or_mended(self, estimate, caplog):
+        truth = trajectory()
+        late = Trajectory(t_us=truth.t_us + 30_000, T_world_camera=truth.T_world_camera)
+        found = refine_poses(event_stream(), late, CAMERA, CONFIG, estimate_time_offset=estimate)
+        report = found.report
+        assert report.time_offset_us == pytest.approx(-30_000, abs=5_000)
+        assert (PoseProblem.TIME_OFFSET in report.problems) == (not estimate)
+        assert ("their clock is not that of the events" in caplog.text) == (not estimate)
+        np.testing.assert_array_equal(found.trajectory.t_us, late.t_us)
+        if estimate:
+            assert report.time_offset_us == pytest.approx(-30_000, abs=1_000)
+            # The last 30 ms have no pose of their own and stay at the end.
+            inside = slice(0, -10)
+            moved = found.trajectory.T_world_camera[inside]
+            true = truth.interpolate(np.minimum(late.t_us, truth.t_us[-1]))[inside]
+            assert translation_errors_m(moved, true).mean() < 0.05
+
+
+def test_poses_that_jump_are_told(noisy):
+    tangents = np.zeros((len(noisy), 6))
+    tangents[len(noisy) // 2 :, 3] = 0.2
+    jumping = Trajectory(t_us=noisy.t_us, T_world_camera=noisy.T_world_camera.retract(tangents))
+    found = refine_poses(event_stream(), jumping, CAMERA, CONFIG)
+    assert PoseProblem.JUMPS in found.report.problems
 
 
 class TestInAMap:
