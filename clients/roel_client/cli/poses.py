@@ -13,11 +13,10 @@ from roel_client.cli.configuration import (
 )
 from roel_client.cli.maps import add_recording_options
 from roel_client.cli.output import print_result, progress_bar
-from roel_client.cli.parser import Command, Subparsers, command, suffixed
+from roel_client.cli.parser import Command, Subparsers, UsageError, command, suffixed
 from roel_client.cli.process import interruptible
 from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
-from roel_service.errors import ConfigError
 
 
 def add_commands(subparsers: Subparsers) -> None:
@@ -54,7 +53,7 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     from roel_client import local
 
     if options.estimate_time_offset and options.server is not None:
-        raise ConfigError("--estimate-time-offset", "no --server beside it", "one")
+        raise UsageError("--estimate-time-offset", "no --server beside it", options.server)
     config = effective_config(options, seed_table(options))
     recording = local.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
