@@ -126,7 +126,8 @@ def _reason(best: PoseHypothesis, margin: float, config: LocalizeConfig) -> NoPo
     """Why the best pose may not be relied on; None if it may."""
     sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])
     sigma_m = np.sqrt(np.linalg.eigvalsh(best.covariance[3:, 3:])[-1])
-    evidence = best.score + MARGIN_WEIGHT * margin
+    # Without another pose nothing says that this one stands out.
+    evidence = best.score + (MARGIN_WEIGHT * margin if margin < 1.0 else 0.0)
     if evidence < config.min_score or best.explained_3d < config.min_coverage:
         return NoPoseReason.NOT_IN_MAP
     if sigma > MAX_SIGMA_RAD or sigma_m > MAX_SIGMA_M:

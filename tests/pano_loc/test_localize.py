@@ -168,3 +168,29 @@ def test_gravity_leaves_few_orientations_and_finds_the_same_place(room):
     result = localize_arcs(arcs, [room], CONFIG, gravity=gravity)
     require_pose(result, truth)
     assert result.rotation_count < free.rotation_count / 3
+
+
+def test_a_room_is_found_among_others_in_one_map():
+    shift = np.array([0.0, 3.4, 0.0])
+    further = segments_of(OTHER_ROOM, OTHER_FURNITURE) + shift
+    both = np.concatenate([segments_of(), further])
+    both = both + np.random.default_rng(0).normal(0.0, 0.005, both.shape)
+    prepared = prepare_map(LineMap.from_segments(both), CONFIG)
+    # The picture shows the lines of its own room alone.
+    result = localize_arcs(seen_from(POSES[1], segments_of()), [prepared], CONFIG)
+    require_pose(result, POSES[1])
+    truth = pose(2.4, 1.2 + shift[1], 1.4, 0.1, 0.0, 1.0)
+    require_pose(localize_arcs(seen_from(truth, further), [prepared], CONFIG), truth)
+
+
+def test_the_covariance_is_that_of_the_errors():
+    squares = []
+    for seed in range(6):
+        segments = segments_of()
+        noise = np.random.default_rng(seed).normal(0.0, 0.01, segments.shape)
+        prepared = prepare_map(LineMap.from_segments(segments + noise), CONFIG)
+        arcs = seen_from(POSES[0], segments, noise_rad=NOISE_RAD, seed=seed)
+        result = localize_arcs(arcs, [prepared], CONFIG, prior=PosePrior(T_world_picture=POSES[0]))
+        error = result.T_world_panorama.local(POSES[0])
+        squares.append(error @ np.linalg.solve(result.hypotheses[0].covariance, error) / 6)
+    assert 0.2 < np.mean(squares) < 4.0
