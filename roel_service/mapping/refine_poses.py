@@ -16,7 +16,8 @@ from roel_service.arrays import FloatArray
 from roel_service.config.stages import Config
 from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
-from roel_service.geometry.alignment import align_poses
+from roel_service.geometry.alignment import align_points, align_poses
+from roel_service.geometry.se3 import SE3
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
@@ -171,6 +172,7 @@ def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) 
     """The refined poses, in the world of the given ones or of the map."""
     poses = found.last.correction.trajectory(found.smooth).T_world_camera
     if is_aligned:
+        poses = _as_large_as(poses, trajectory.T_world_camera)
         poses = align_poses(poses, trajectory.T_world_camera) @ poses
     refined = Trajectory(t_us=found.given.t_us, T_world_camera=poses)
     if found.given.t_us[0] == trajectory.t_us[0]:
@@ -178,6 +180,17 @@ def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) 
     # Poses that the other clock leaves without a time of their own stay at the ends.
     times_us = np.clip(trajectory.t_us, refined.t_us[0], refined.t_us[-1])
     return Trajectory(t_us=trajectory.t_us, T_world_camera=refined.interpolate(times_us))
+
+
+def _as_large_as(poses: SE3, given: SE3) -> SE3:
+    """Poses whose path is as large as that of the given ones: lines do not tell the scale.
+
+    Steps of the solver drift along it, by more than the given poses are off.
+    """
+    scale = align_points(poses.translation, given.translation, with_scale=True).scale
+    middle = poses.translation.mean(axis=0)
+    translation = middle + scale * (poses.translation - middle)
+    return SE3(rotation=poses.rotation, translation=translation)
 
 
 def _report(
