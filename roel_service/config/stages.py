@@ -449,7 +449,7 @@ class LocalizeConfig(Stage, table="localize"):
     max_rotation_count: int = parameter(64, at_most(1000))
     candidate_count: int = parameter(72, at_most(1000))
     max_hypothesis_count: int = parameter(5, Rule("1 to 5", lambda value: 1 <= value <= 5))
-    min_score: float = parameter(0.31, SHARE)
+    min_score: float = parameter(0.3, SHARE)
     min_coverage: float = parameter(0.1, SHARE)
     min_margin: float = parameter(0.12, SHARE)
 

@@ -36,7 +36,7 @@ BOX_QUANTILES = (0.02, 0.98)
 BOX_MARGIN_M = 0.2
 SAMPLE_SPACING_M = 0.05
 # The grid is wider in large maps, and finer in small ones.
-MIN_PLACE_COUNT, MAX_PLACE_COUNT = 400, 4000
+MIN_PLACE_COUNT, MAX_PLACE_COUNT = 400, 12000
 # Shorter lines are more noise than line.
 MIN_LINE_M = 0.05
 

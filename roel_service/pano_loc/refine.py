@@ -23,7 +23,7 @@ FINAL_STEP_RAD = np.deg2rad(2.0)
 FINAL_GATE_RAD = np.deg2rad(5.0)
 FINAL_WIDTHS_RAD = np.deg2rad([0.7, 0.5, 0.5, 0.5])
 # The same for more of the modes, on fewer arcs.
-MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([1.5, 1.0, 0.7])
+MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
 MODE_ARC_COUNT, MODE_STEP_RAD = 200, np.deg2rad(6.0)
 # Width of the kernel of a pose's score.
 SCORE_WIDTH_RAD = np.deg2rad(0.7)
