@@ -393,6 +393,7 @@ def _registration_document(result: RegistrationResult, seconds: float) -> dict[s
         "stop_reason": result.stop_reason.value,
         "verdict": result.verdict.value,
         "fitness": result.fitness,
+        "overlap": result.overlap,
         "agreement": result.agreement,
         "inlier_rmse_m": result.inlier_rmse_m,
         "information": None if information is None else information.tolist(),

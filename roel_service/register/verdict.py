@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from roel_service.arrays import BoolArray, FloatArray
 from roel_service.config.stages import RegisterConfig
@@ -119,6 +120,7 @@ def judge(
         stop_reason=alignment.stop_reason if near.any() else StopReason.NO_OVERLAP,
         verdict=_verdict(fitness, found, bool(alternatives) or len(weak) > 0, config),
         fitness=fitness,
+        overlap=overlap(moved, target),
         agreement=found.score,
         inlier_rmse_m=float(np.sqrt((distance_m[near] ** 2).mean())) if near.any() else None,
         information=held,
@@ -126,6 +128,25 @@ def judge(
         alternatives=tuple(alternatives),
         iteration_count=alignment.iteration_count,
     )
+
+
+def overlap(moved: FloatArray, target: PreparedCloud) -> float:
+    """Share of the target's creases inside the map's box that have a sample of the map near them.
+
+    Surfaces do not count: between its lines a map says nothing of them.
+
+    Args:
+        moved: (P, 3) the map's samples in the target, m.
+    """
+    reach_m = CREASE_REACH * target.resolution_m
+    creases = target.creases.points
+    low, high = moved.min(axis=0) - reach_m, moved.max(axis=0) + reach_m
+    inside = creases[((creases >= low) & (creases <= high)).all(axis=1)]
+    if len(inside) == 0:
+        return 0.0
+    some = inside[:: -(-len(inside) // JUDGED_COUNT)]
+    distance_m, _ = cKDTree(moved).query(some, distance_upper_bound=reach_m)
+    return float(np.isfinite(distance_m).mean())
 
 
 def _verdict(

@@ -104,6 +104,7 @@ class RegistrationResult:
         stop_reason: why the iterations ended.
         verdict: whether the transform may be relied on.
         fitness: share of the source's samples with something of the target near by, 0 to 1.
+        overlap: share of the target's creases inside the source's box that a sample is near, 0 to 1.
         agreement: share of the samples on surfaces and on creases that run their way, 0 to 1.
         inlier_rmse_m: of those samples; None without any.
         information: (6, 6) inverse covariance of (r, d), target frame; None without a fit.
@@ -118,6 +119,7 @@ class RegistrationResult:
     stop_reason: StopReason
     verdict: Verdict
     fitness: float
+    overlap: float
     agreement: float
     inlier_rmse_m: float | None
     information: FloatArray | None

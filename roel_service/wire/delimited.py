@@ -15,7 +15,8 @@ MAX_VARINT_BYTES = 5
 
 def delimited(message: Any) -> bytes:
     """One message of a file."""
-    data = message.SerializeToString()
+    # Map fields have no order of their own.
+    data = message.SerializeToString(deterministic=True)
     return _varint(len(data)) + bytes(data)
 
 

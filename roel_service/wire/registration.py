@@ -69,6 +69,7 @@ def registration_to_proto(result: RegistrationResult) -> registration_pb2.Regist
         stop_reason=result.stop_reason.value,
         verdict=_VERDICTS[result.verdict],
         fitness=result.fitness,
+        overlap=result.overlap,
         agreement=result.agreement,
         inlier_rmse_m=result.inlier_rmse_m,
         weak_directions=[
@@ -100,6 +101,7 @@ def registration_from_proto(message: registration_pb2.RegisterResponse) -> Regis
         stop_reason=StopReason(message.stop_reason),
         verdict=verdicts[message.verdict],
         fitness=message.fitness,
+        overlap=message.overlap,
         agreement=message.agreement,
         inlier_rmse_m=message.inlier_rmse_m if message.HasField("inlier_rmse_m") else None,
         information=(

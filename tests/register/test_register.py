@@ -6,8 +6,10 @@ import pytest
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import CloudError, NoAnswerError
 from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
+from roel_service.geometry.segments import sample_segments
 from roel_service.register.prepare import prepare_cloud
 from roel_service.register.register import register_map
+from roel_service.register.verdict import overlap
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import Verdict
@@ -262,3 +264,11 @@ def test_a_unit_that_is_off_by_a_thousand_is_named(factor, unit):
     with pytest.raises(CloudError, match=f"factor of about 1000, as between {unit}") as caught:
         register_map(room_map(), scaled, CONFIG)
     assert caught.value.reason == "CLOUD_UNIT"
+
+
+def test_overlap_is_how_much_of_the_target_around_it_the_map_explains(prepared):
+    points, line = sample_segments(room_map().segments, 0.02)
+    whole, every_third = overlap(points, prepared), overlap(points[line % 3 == 0], prepared)
+    assert whole > 0.9
+    assert 0.15 < every_third < 0.6
+    assert overlap(points + 100.0, prepared) == 0.0

@@ -147,6 +147,7 @@ def folder(tmp_path_factory, picture):
     np.savetxt(path / "T.txt", T)
     (path / "room.png").write_bytes(picture)
     tables = "[register]\nvoxel_m = 0.08\ncandidate_count = 2\n[localize]\ngrid_step_m = 0.8\n"
+    tables += "crop_px = 240\ncandidate_count = 24\n"
     (path / "coarse.toml").write_text(tables)
     return path
 
