@@ -120,14 +120,18 @@ class Journal:
         rows: by the index of their query.
 
     Raises:
-        InputError: the file has answers to something else.
+        InputError: the file has answers to something else, or cannot be written.
     """
 
     def __init__(self, path: Path, asked: dict[str, Any]) -> None:
         self.rows: dict[int, Row] = {}
         self._path = path
         whole_bytes = self._read(asked) if path.exists() else 0
-        self._file = path.open("r+b" if path.exists() else "wb")
+        try:
+            self._file = path.open("r+b" if path.exists() else "wb")
+        except OSError as error:
+            found = error.strerror or "none"
+            raise InputError(str(path), "a file that can be written", found) from error
         # The line that was being written.
         self._file.truncate(whole_bytes)
         self._file.seek(whole_bytes)

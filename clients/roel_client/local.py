@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import hashlib
 import logging
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -550,7 +551,7 @@ def localize_batch(
     queries = batch.read_manifest(manifest)
     parallel_count = worker_count or batch.default_worker_count()
     asked = {
-        "queries": [query.panorama for query in queries],
+        "manifest": hashlib.sha256(Path(manifest).read_bytes()).hexdigest(),
         "maps": [name if is_resource_name(name) else _digest(name) for name in names],
         "config": dataclasses.asdict(config),
     }

@@ -120,6 +120,11 @@ def test_a_journal_of_other_queries_is_left_alone(queries, tmp_path):
     assert (tmp_path / "journal").read_bytes() == before
 
 
+def test_a_journal_needs_a_place(tmp_path):
+    with pytest.raises(InputError, match="a file that can be written, found No such file"):
+        Journal(tmp_path / "nowhere" / "journal", ASKED)
+
+
 def test_the_table_has_a_line_for_each_row(queries, tmp_path):
     rows = located(queries, tmp_path / "journal", Places())
     write_table(rows, tmp_path / "rows.jsonl")
