@@ -36,6 +36,11 @@ def _without(what: str, **changes: dict[str, Any]) -> Variant:
     return Variant(name=f"default without {what}", changes=changes)
 
 
+def _refined(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """The same for every refinement: between the rounds, and the last one."""
+    return {"refine_rounds": changes, "refine": changes}
+
+
 def _paper(name: str, **changes: dict[str, Any]) -> Variant:
     """The paper's pipeline with something changed."""
     return Variant(name=f"paper: {name}", preset="paper", changes=changes)
@@ -82,11 +87,11 @@ DEFAULT_ABLATION = (
     _without("rounds of re-association", match_global={"max_distances_px": [1.5]}),
     _without("speed gate", match_global={"max_speed_difference_px_per_ms": UNLIMITED}),
     _without("sharing rule", match_global={"max_shared_fraction": 1.0}),
-    _without("event term", refine={"event_weight": 0.0}),
+    _without("event term", **_refined({"event_weight": 0.0})),
     _without("all but 50 events a line", refine={"event_count_per_line": 50}),
-    _without("robust loss", refine={"loss": "squared"}),
-    _without("shared directions", refine={"direction_sigma_deg": 0.0}),
-    _without("refinement", refine=NO_STEPS),
+    _without("robust loss", **_refined({"loss": "squared"})),
+    _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
+    _without("refinement", **_refined(NO_STEPS)),
     _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
     _without("uncertainty filter", trim={"max_sigma_m": UNLIMITED}),
     _without("rms filter", trim={"max_rms_px": UNLIMITED}),

@@ -10,6 +10,7 @@ from roel_service.config.stages import (
     MatchLocalConfig,
     PlaneFitConfig,
     RefineConfig,
+    RefineRoundsConfig,
     TriangulateConfig,
     TrimConfig,
 )
@@ -50,6 +51,8 @@ PAPER = Config(
         max_residual_px=20.0,
         min_inlier_count=10,
     ),
+    # What triangulation takes from here; the rest of its cost is its own.
+    refine_rounds=RefineRoundsConfig(max_residual_px=20.0, min_inlier_count=10),
     trim=TrimConfig(
         method="cluster",
         max_sigma_m=UNLIMITED,

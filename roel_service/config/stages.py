@@ -296,8 +296,46 @@ class TriangulateConfig(Stage, table="triangulate"):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineConfig(Stage, table="refine"):
-    """Joint least squares over the line term and the event term.
+class RefineRoundsConfig(Stage, table="refine_rounds"):
+    """Least squares over lines while they still collect observations.
+
+    After triangulation and between the rounds of re-association. The last refinement has the same
+    parameters in a table of its own, so that who changes it need not have the lines found again.
+
+    Attributes:
+        residual: `pixel` (both terms as angles times focal length), `grassmann` (as published) or
+            `reprojection` (the observed ends' distances from the line's image, as LIMAP does).
+        loss: `cauchy`, `squared` (none) or `quartic` (the square of each squared residual: the
+            other reading of the published cost).
+        loss_scale_px: residual at which the Cauchy loss starts to bend.
+        event_weight: weight of the event term against the line term; its unit follows `residual`.
+        max_length_weight_px: observations longer than this weigh no more.
+        direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
+            refines every line on its own.
+        direction_noise_px: noise of an observation as a whole, for the uncertainty of directions.
+        max_direction_distance: a line this many standard deviations from a shared direction, or
+            fewer, is held to it.
+        iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as they are.
+        max_residual_px: observations beyond it are left out of the next step.
+        min_inlier_count: a line with fewer has diverged.
+    """
+
+    residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
+    loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
+    loss_scale_px: float = parameter(0.7, POSITIVE)
+    event_weight: float = parameter(1.0, NOT_NEGATIVE)
+    max_length_weight_px: float = parameter(60.0, POSITIVE)
+    direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
+    direction_noise_px: float = parameter(0.3, POSITIVE)
+    max_direction_distance: float = parameter(3.0, POSITIVE)
+    iteration_count: int = parameter(8, UP_TO_1000)
+    max_residual_px: float = parameter(2.0, POSITIVE)
+    min_inlier_count: int = parameter(3, AT_LEAST_TWO)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineConfig(RefineRoundsConfig, table="refine"):
+    """Joint least squares over the line term and the event term: the last refinement.
 
     Attributes:
         residual: `pixel` (both terms as angles times focal length), `grassmann` (as published) or
@@ -307,6 +345,7 @@ class RefineConfig(Stage, table="refine"):
         loss_scale_px: residual at which the Cauchy loss starts to bend.
         event_weight: weight of the event term against the line term; its unit follows `residual`.
         event_count_per_line: supporting events used an observation, nearest in time; 0 uses all.
+            Events are summed up where lines are found in frames, so that this one is read there.
         max_length_weight_px: observations longer than this weigh no more.
         direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
             refines every line on its own.
@@ -327,18 +366,7 @@ class RefineConfig(Stage, table="refine"):
         pose_drift_s: the time after which they have forgotten it.
     """
 
-    residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
-    loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
-    loss_scale_px: float = parameter(0.7, POSITIVE)
-    event_weight: float = parameter(1.0, NOT_NEGATIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
-    max_length_weight_px: float = parameter(60.0, POSITIVE)
-    direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
-    direction_noise_px: float = parameter(0.3, POSITIVE)
-    max_direction_distance: float = parameter(3.0, POSITIVE)
-    iteration_count: int = parameter(8, UP_TO_1000)
-    max_residual_px: float = parameter(2.0, POSITIVE)
-    min_inlier_count: int = parameter(3, AT_LEAST_TWO)
     free_poses: bool = False
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.5, 2.0, 1.5, 1.3), SOME_POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)
@@ -549,4 +577,5 @@ class Config:
     runtime: RuntimeConfig = RuntimeConfig()
     curves: CurvesConfig = CurvesConfig()
     localize: LocalizeConfig = LocalizeConfig()
+    refine_rounds: RefineRoundsConfig = RefineRoundsConfig()
     track: TrackConfig = TrackConfig()

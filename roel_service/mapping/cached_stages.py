@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from roel_service.config.stages import Config, RefineConfig
+from roel_service.config.stages import Config, RefineRoundsConfig
 from roel_service.mapping.front_end import Detected
 from roel_service.mapping.refine import Refined
 from roel_service.mapping.run import CountedEvents, MappingRun
@@ -84,7 +84,7 @@ class CachedStages:
             config.match_local,
             config.match_global,
             config.triangulate,
-            config.refine,
+            config.refine_rounds,
             config.runtime.seed,
         )
         return self._refined("match_global", ("match_global",), parameters, find)
@@ -107,16 +107,16 @@ class CachedStages:
         return refined
 
 
-def triangulation_cost(config: Config) -> RefineConfig:
+def triangulation_cost(config: Config) -> RefineRoundsConfig:
     """What refines a hypothesis over its inliers.
 
     With the paper's gate it is the paper's cost: the sum of the line term alone, unweighted.
     """
     steps = config.triangulate.iteration_count
     if config.triangulate.gate == "pixel":
-        return replace(config.refine, iteration_count=steps)
+        return replace(config.refine_rounds, iteration_count=steps)
     return replace(
-        config.refine,
+        config.refine_rounds,
         residual="grassmann",
         loss="squared",
         event_weight=0.0,
@@ -125,9 +125,9 @@ def triangulation_cost(config: Config) -> RefineConfig:
     )
 
 
-def _without_directions(config: RefineConfig) -> RefineConfig:
+def _without_directions(config: RefineRoundsConfig) -> RefineRoundsConfig:
     """The same for lines that are refined on their own."""
-    defaults = RefineConfig()
+    defaults = RefineRoundsConfig()
     return replace(
         config,
         direction_sigma_deg=defaults.direction_sigma_deg,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from roel_service.arrays import Array, FloatArray
-from roel_service.config.stages import RefineConfig
+from roel_service.config.stages import RefineRoundsConfig
 from roel_service.geometry.vectors import unit
 from roel_service.mapping.refine import DirectionPrior, Refined
 
@@ -88,7 +88,7 @@ class _UncertainDirections:
         return np.asarray(self.peak * np.exp(-0.5 * self.squared_distance(directions)))
 
 
-def direction_prior(refined: Refined, config: RefineConfig) -> DirectionPrior | None:
+def direction_prior(refined: Refined, config: RefineRoundsConfig) -> DirectionPrior | None:
     """The prior of each line, from the directions that these lines share; None if it is off."""
     if config.direction_sigma_deg == 0.0 or len(refined) == 0:
         return None
@@ -103,7 +103,7 @@ def direction_prior(refined: Refined, config: RefineConfig) -> DirectionPrior | 
     return DirectionPrior(direction=common[nearest], weight=weight * within)
 
 
-def common_directions(refined: Refined, config: RefineConfig) -> FloatArray:
+def common_directions(refined: Refined, config: RefineRoundsConfig) -> FloatArray:
     """(D, 3) unit directions that many lines share, the most frequent first.
 
     Args:
@@ -175,7 +175,7 @@ def _candidates(lines: _UncertainDirections) -> FloatArray:
     return np.concatenate([lines.direction[most_certain], crossing[clear] / length[clear, None]])
 
 
-def _uncertain_directions(refined: Refined, config: RefineConfig) -> _UncertainDirections:
+def _uncertain_directions(refined: Refined, config: RefineRoundsConfig) -> _UncertainDirections:
     direction = refined.lines.direction
     dv, _ = refined.jacobians()
     covariance = config.direction_noise_px**2 * dv @ refined.covariance @ np.swapaxes(dv, -1, -2)

@@ -41,7 +41,7 @@ def measure_evidence(
 ) -> Evidence:
     """Viewing planes and quadratic forms of observations that carry their events."""
     forms = supporting_forms(observations, frames, trajectory, frames_config, refine_config)
-    return evidence_of(observations, frames, forms, np.diff(observations.event_offsets))
+    return evidence_of(observations, frames, forms, supporting_counts(observations, refine_config))
 
 
 def supporting_forms(
@@ -63,6 +63,12 @@ def supporting_forms(
         frames_config.slot_us,
         refine_config.event_count_per_line,
     )
+
+
+def supporting_counts(observations: LineObservations, refine_config: RefineConfig) -> Array:
+    """(M,) events behind each of the `supporting_forms`."""
+    counts = np.diff(observations.event_offsets)
+    return np.minimum(counts, refine_config.event_count_per_line or len(observations.event_dt_us))
 
 
 def evidence_of(

@@ -20,7 +20,12 @@ from roel_service.geometry.projection import undistortion_table
 from roel_service.in_order import in_order
 from roel_service.mapping.curve_pieces import FRAME_STEP, pieces_of_frame
 from roel_service.mapping.detect import EDLines, LineDetector, detect_lines
-from roel_service.mapping.evidence import Evidence, evidence_of, supporting_forms
+from roel_service.mapping.evidence import (
+    Evidence,
+    evidence_of,
+    supporting_counts,
+    supporting_forms,
+)
 from roel_service.mapping.frames import (
     Frames,
     event_frame,
@@ -131,8 +136,9 @@ class FrameReader:
         if self._drawing is not None and index % FRAME_STEP == 0:
             pieces = pieces_of_frame(drawn, fitted, frame, self._drawing, config)
         # The events end here: memory grows with the lines, not with the recording.
+        observations = observations_of_frames([fitted])
         forms = supporting_forms(
-            observations_of_frames([fitted]),
+            observations,
             frames_at(np.array([t_us]), self._trajectory, self._camera),
             self._trajectory,
             config.frames,
@@ -142,7 +148,7 @@ class FrameReader:
             t_us=t_us,
             fitted=fitted.without_events(),
             event_forms=forms,
-            event_counts=np.diff(fitted.event_offsets),
+            event_counts=supporting_counts(observations, config.refine),
             pieces=pieces,
             images=images,
             detect_s=detected - started,

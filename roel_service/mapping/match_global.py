@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from roel_service.arrays import FloatArray, IntArray
-from roel_service.config.stages import Config, MatchGlobalConfig, RefineConfig
+from roel_service.config.stages import Config, MatchGlobalConfig, RefineRoundsConfig
 from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
@@ -60,7 +60,7 @@ def reassociate(
         refined: first lines with their tracks.
         evidence, observations: of all frames.
         frames, trajectory: poses; the trajectory gives the camera's velocity.
-        config: `match_global` and, for between the rounds, `refine`. Speeds can be predicted where
+        config: `match_global` and, for between the rounds, `refine_rounds`. Speeds can be predicted where
             `frames` undoes the camera's rotation.
         progress: called once a round; may raise `Cancelled`.
     """
@@ -72,10 +72,10 @@ def reassociate(
         found = _associate(
             refined, evidence.views, observations, frames, velocity, max_distance_px, settings
         )
-        refined = _held(refined, found, evidence, frames, config.refine)
+        refined = _held(refined, found, evidence, frames, config.refine_rounds)
         refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
         exclusive = _exclusive(refined, evidence.views, frames)
-        refined = _held(refined, exclusive, evidence, frames, config.refine)
+        refined = _held(refined, exclusive, evidence, frames, config.refine_rounds)
     return refined
 
 
@@ -102,7 +102,7 @@ def match_fixed_lines(
     velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
     distance_px = settings.max_distances_px[0]
     pairs = _along(lines, spans, observations, frames, velocity, distance_px, settings)
-    stay = replace(config.refine, iteration_count=0)
+    stay = replace(config.refine_rounds, iteration_count=0)
     tracks = LineTracks.from_rows(*pairs, len(lines))
     found = _usable(refine_lines(lines, tracks, evidence, frames, stay))
     exclusive = _exclusive(found, evidence.views, frames)
@@ -110,7 +110,11 @@ def match_fixed_lines(
 
 
 def _held(
-    refined: Refined, tracks: LineTracks, evidence: Evidence, frames: Frames, config: RefineConfig
+    refined: Refined,
+    tracks: LineTracks,
+    evidence: Evidence,
+    frames: Frames,
+    config: RefineRoundsConfig,
 ) -> Refined:
     """The lines refined over other tracks, held by the directions that they share so far."""
     prior = direction_prior(refined, config)

@@ -5,7 +5,7 @@ unknown, and all of them are solved together as a batch of systems of four: damp
 the orthonormal parameterisation, about an own origin for each line (the mean of its cameras), where
 the moment's length is the viewing distance and far from zero.
 
-Three costs, see `RefineConfig.residual`:
+Three costs, see `RefineRoundsConfig.residual`:
 
 - `pixel`: line and event term are quadratic forms y^T G y / |m_c|^2 of the Pluecker coordinates
   y = (v, m), in squared pixels (`moments`), with a robust weight an observation.
@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from roel_service.arrays import Array, BoolArray, FloatArray
-from roel_service.config.stages import RefineConfig
+from roel_service.config.stages import RefineRoundsConfig
 from roel_service.geometry import grassmann, plucker, reprojection
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import dot, norm
@@ -153,7 +153,7 @@ class _Problem:
         tracks: LineTracks,
         evidence: Evidence,
         frames: Frames,
-        config: RefineConfig,
+        config: RefineRoundsConfig,
         prior: DirectionPrior | None = None,
     ) -> None:
         self.config = config
@@ -173,10 +173,9 @@ class _Problem:
         length = np.minimum(self.views.length_px, config.max_length_weight_px)
         if config.residual == "grassmann":
             # As published: the length in pixels, and lambda for each event.
-            event_count = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
             self.weight = length
             self.forms = evidence.event_forms
-            self.form_weight = config.event_weight * event_count[tracks.observation]
+            self.form_weight = config.event_weight * evidence.event_counts[tracks.observation]
         else:
             forms = config.event_weight * evidence.event_forms
             if config.residual == "pixel":
@@ -372,7 +371,7 @@ def refine_lines(
     tracks: LineTracks,
     evidence: Evidence,
     frames: Frames,
-    config: RefineConfig,
+    config: RefineRoundsConfig,
     prior: DirectionPrior | None = None,
 ) -> Refined:
     """Refine every line over its observations; the poses stay as they are.

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from roel_service.arrays import FloatArray
-from roel_service.config.stages import Config
+from roel_service.config.stages import Config, RefineRoundsConfig
 from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_points, align_poses
@@ -42,6 +43,8 @@ from roel_service.scene.results import MAPPING_STAGES, PoseProblem, PoseReport, 
 from roel_service.scene.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
+
+Costs = TypeVar("Costs", bound=RefineRoundsConfig)
 
 # Fewer lines than this do not hold six unknowns.
 MIN_LINE_COUNT = 6
@@ -334,15 +337,19 @@ def _check_count(refined: Refined) -> None:
 
 def _with_gate(config: Config, gate_px: float) -> Config:
     """Matching and refinement within a distance, never closer than with known poses."""
-    refine = config.refine
     return replace(
         config,
         match_global=replace(config.match_global, max_distances_px=(gate_px,)),
-        refine=replace(
-            refine,
-            max_residual_px=max(refine.max_residual_px, gate_px),
-            loss_scale_px=max(refine.loss_scale_px, FULL_WEIGHT_SHARE * gate_px),
-        ),
+        refine_rounds=_widened(config.refine_rounds, gate_px),
+        refine=_widened(config.refine, gate_px),
+    )
+
+
+def _widened(costs: Costs, gate_px: float) -> Costs:
+    return replace(
+        costs,
+        max_residual_px=max(costs.max_residual_px, gate_px),
+        loss_scale_px=max(costs.loss_scale_px, FULL_WEIGHT_SHARE * gate_px),
     )
 
 

@@ -36,5 +36,8 @@ def test_lines_and_counts_are_those_of_the_observations():
     )
     evidence = measure_evidence(few, exact.frames, exact.trajectory, FramesConfig(), RefineConfig())
     assert evidence.event_counts.tolist() == [40, 40, 20] + [0] * 285
+    config = RefineConfig(event_count_per_line=30)
+    limited = measure_evidence(few, exact.frames, exact.trajectory, FramesConfig(), config)
+    assert limited.event_counts.tolist() == [30, 30, 20] + [0] * 285
     np.testing.assert_array_equal(evidence.segment_forms, segment_forms(few, exact.frames))
     np.testing.assert_array_equal(evidence.views.normal, exact.views.normal)

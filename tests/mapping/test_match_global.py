@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from roel_service.config.stages import Config, MatchGlobalConfig, RefineConfig
+from roel_service.config.stages import Config, MatchGlobalConfig, RefineRoundsConfig
 from roel_service.errors import Cancelled
 from roel_service.geometry import plucker, projection, segments
 from roel_service.mapping.match_global import _exclusive, project_segments, reassociate
@@ -12,7 +12,7 @@ from roel_service.scene.lines import InfiniteLines, LineTracks
 
 from .synthetic import CAMERA, line_errors, observed, still_frames, world
 
-CONFIG = Config(refine=RefineConfig(event_weight=0.0))
+CONFIG = Config(refine_rounds=RefineRoundsConfig(event_weight=0.0))
 
 
 def unwatched(done_count, total_count):
