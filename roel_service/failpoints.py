@@ -9,8 +9,12 @@ from __future__ import annotations
 import os
 import random
 import signal
+import sys
 
 VARIABLE = "ROEL_FAILPOINT"
+
+# What a process that dies at one says last, to stderr, before the place.
+MET = "died at failpoint"
 
 # Every step after which something is durable that was not so before, in the words of its module.
 FAILPOINTS = (
@@ -39,6 +43,7 @@ def failpoint(name: str) -> None:
     """Die here, if the environment says so."""
     wanted = os.environ.get(VARIABLE)
     if wanted and random.random() < _probability(wanted, name):
+        os.write(sys.stderr.fileno(), f"{MET} {name}\n".encode())
         os.kill(os.getpid(), signal.SIGKILL)
 
 

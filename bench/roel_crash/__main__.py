@@ -12,7 +12,7 @@ from roel_crash.run import crash
 
 
 def main() -> int:
-    """Kill, print what came of it; 1 if a promise was broken."""
+    """Kill, print what came of it; 1 if a promise was broken or a named step never met."""
     parser = argparse.ArgumentParser(prog="python -m roel_crash")
     parser.add_argument("--kills", type=int, default=210)
     parser.add_argument("--seed", type=int, default=0)
@@ -27,7 +27,7 @@ def main() -> int:
     if options.out is not None:
         options.out.write_text(text + "\n")
     print(text)
-    return 1 if outcome.broken else 0
+    return 1 if outcome.broken or outcome.missed else 0
 
 
 if __name__ == "__main__":

@@ -1,13 +1,16 @@
-"""A client that uploads and builds for ever, whatever happens to the server."""
+"""A client that uploads, builds and forgets for ever, whatever happens to the server."""
 
 from __future__ import annotations
 
+import tempfile
 import threading
 import uuid
+from pathlib import Path
 
 import numpy as np
 
 from roel_client import Client
+from roel_client.client import Operation
 from roel_crash.ledger import Ledger, end_of
 from roel_service.config.presets import preset
 from roel_service.errors import NotFoundError, RoelError, StateError, UnavailableError
@@ -21,6 +24,10 @@ CAMERA = Camera(width=64, height=48, fx_px=50.0, fy_px=50.0, cx_px=32.0, cy_px=2
 
 # Three chunks: enough for an upload to be cut in its middle.
 EVENT_COUNT = 300_000
+# Three parts.
+BLOB_BYTES = 3 * 2**20
+FOLLOWED_SHARE = 0.5
+FORGOTTEN_SHARE = 0.5
 
 
 class Checker(threading.Thread):
@@ -48,12 +55,30 @@ class Checker(threading.Thread):
                     self._ended.wait(0.2)
 
     def _work(self, client: Client) -> None:
+        """A blob, a recording and a build, which follows every second upload."""
+        self._upload_blob(client)
+        follow = self._rng.random() < FOLLOWED_SHARE
         stream = client.create_event_stream(_new_id(), CAMERA)
         client.upload_poses(stream, self._trajectory())
+        map_name = client.create_map(_new_id())
+        config = preset("default")
+        operation = client.build_map(map_name, stream, config, follow=True) if follow else None
         client.upload_events(stream, self._events(), lambda told: self._note(stream, told))
         self._ledger.note_frozen(client.finalize(stream))
-        map_name = client.create_map(_new_id())
-        operation = client.build_map(map_name, stream, preset("default"))
+        self._await(operation or client.build_map(map_name, stream, config))
+        if self._rng.random() < FORGOTTEN_SHARE:
+            # What it held is garbage then, for sweeps to find.
+            self._ledger.forget(stream)
+            client.delete_event_stream(stream)
+
+    def _upload_blob(self, client: Client) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "blob")
+            path.write_bytes(self._rng.bytes(BLOB_BYTES))
+            self._ledger.note_blob(client.upload_blob(path))
+
+    def _await(self, operation: Operation) -> None:
+        """Write down how a build ends."""
         try:
             version = operation.wait()
         except (NotFoundError, StateError) as error:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import tempfile
 import threading
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from roel_client import Client
 from roel_service.errors import NotFoundError, RoelError
-from roel_service.v1 import events_pb2, maps_pb2
+from roel_service.v1 import events_pb2, maps_pb2, types_pb2
+
+# The newest ones are read back after each kill; the check of the folder reads all.
+READ_BLOB_COUNT = 5
 
 
 @dataclass
@@ -18,6 +23,7 @@ class Ledger:
     Attributes:
         events: recording to events acknowledged.
         digests: frozen recording to its digest.
+        blobs: digest of an uploaded file to its size.
         maps: version to the digest of its map file.
         ends: operation to how it ended.
         broken: promises that were not kept, one line each.
@@ -25,6 +31,7 @@ class Ledger:
 
     events: dict[str, int] = field(default_factory=dict)
     digests: dict[str, str] = field(default_factory=dict)
+    blobs: dict[str, int] = field(default_factory=dict)
     maps: dict[str, str] = field(default_factory=dict)
     ends: dict[str, str] = field(default_factory=dict)
     broken: list[str] = field(default_factory=list)
@@ -39,6 +46,16 @@ class Ledger:
         """A recording is frozen."""
         with self._lock:
             self.digests[stream.name] = stream.digest
+
+    def note_blob(self, blob: types_pb2.BlobRef) -> None:
+        """A file is there as a whole."""
+        with self._lock:
+            self.blobs[blob.sha256] = blob.size_bytes
+
+    def forget(self, stream: str) -> None:
+        """A recording is about to be deleted."""
+        with self._lock:
+            del self.events[stream], self.digests[stream]
 
     def note_map(self, version: maps_pb2.MapVersion) -> None:
         """A version is complete."""
@@ -55,13 +72,22 @@ class Ledger:
         """Ask a server for everything; what it does not know any more is a broken promise."""
         with self._lock:
             events, digests, maps = dict(self.events), dict(self.digests), dict(self.maps)
+            blobs = list(self.blobs.items())[-READ_BLOB_COUNT:]
         for name, event_count in events.items():
-            self._expect(name, event_count <= self._found(client, name).event_count, "lost events")
+            is_kept = event_count <= self._found(client, name).event_count
+            self._expect(name, is_kept or name not in self.events, "lost events")
         for name, digest in digests.items():
-            self._expect(name, digest == self._found(client, name).digest, "another digest")
+            is_kept = digest == self._found(client, name).digest
+            self._expect(name, is_kept or name not in self.digests, "another digest")
         for name, sha256 in maps.items():
             found = hashlib.sha256(client.download_map(name)).hexdigest()
             self._expect(name, found == sha256, "another map")
+        with tempfile.TemporaryDirectory() as folder:
+            for sha256, size_bytes in blobs:
+                path = Path(folder, sha256)
+                client.download_blob(sha256, path)
+                self._expect(sha256, path.stat().st_size == size_bytes, "another size")
+                path.unlink()
 
     def _found(self, client: Client, name: str) -> events_pb2.EventStream:
         try:

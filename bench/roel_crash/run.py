@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import random
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,11 +21,17 @@ from roel_service.store.store import Store
 
 # A named step that is not met within this time is not part of what the checkers do just then.
 STEP_TIMEOUT_S = 15.0
-# Steps that are met at every start; now and then one is survived.
-STEPS_OF_STARTS = ("rows.written", "rows.committed")
+# Steps that are met at every start, and one that ends an operation when every attempt dies there:
+# now and then one is survived.
+SURVIVED = {"rows.written": 0.1, "rows.committed": 0.1, "stage.cached": 0.5}
+# So often a step is tried again that was never met.
+RETRY_COUNT = 8
 LONGEST_LIFE_S = 2.5
 
 CHECKER_COUNT = 2
+
+# What is counted of a kill for which there was no occasion.
+NOT_MET = " (not met)"
 
 # Connections of one process share how long they wait before they try again: up to some seconds.
 PATIENT = RetryPolicy(attempt_count=30, longest_pause_s=1.0)
@@ -47,12 +53,23 @@ class Outcome:
     event_count: int = 0
     recording_count: int = 0
     map_count: int = 0
+    blob_count: int = 0
     longest_restart_s: float = 0.0
     seconds: float = 0.0
 
+    @property
+    def missed(self) -> list[str]:
+        """Named steps at which nothing died."""
+        return [step for step in FAILPOINTS if not self.kills[step]]
+
     def document(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        return {**asdict(self), "kill_count": self.kills.total()}
+        return {**vars(self), "kill_count": self.kill_count, "missed": self.missed}
+
+    @property
+    def kill_count(self) -> int:
+        """Of those that struck."""
+        return sum(count for name, count in self.kills.items() if not name.endswith(NOT_MET))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,16 +92,26 @@ def plan(kill_count: int, rng: random.Random) -> Iterator[Kill]:
     A named step follows a server's death, because it belongs to the environment of the next one.
     """
     for index in range(kill_count):
-        life_s = rng.uniform(0.05, LONGEST_LIFE_S)
         kind = index % 3
         if kind == 0:
-            yield Kill(name="server", failpoint="", strike=_after(life_s))
+            yield _kill_of_server(rng)
         elif kind == 1:
-            step = FAILPOINTS[index // 3 % len(FAILPOINTS)]
-            condition = f"{step}:exit@{0.1 if step in STEPS_OF_STARTS else 1.0}"
-            yield Kill(name=step, failpoint=condition, strike=_at_step)
+            yield _kill_at_step(FAILPOINTS[index // 3 % len(FAILPOINTS)])
         else:
-            yield Kill(name="child", failpoint="", strike=_child_after(life_s))
+            yield Kill(name="child", failpoint="", strike=_child_after(_life_s(rng)))
+
+
+def _kill_of_server(rng: random.Random) -> Kill:
+    return Kill(name="server", failpoint="", strike=_after(_life_s(rng)))
+
+
+def _kill_at_step(step: str) -> Kill:
+    condition = f"{step}:exit@{SURVIVED.get(step, 1.0)}"
+    return Kill(name=step, failpoint=condition, strike=_at_step(step))
+
+
+def _life_s(rng: random.Random) -> float:
+    return rng.uniform(0.05, LONGEST_LIFE_S)
 
 
 def crash(
@@ -103,15 +130,19 @@ def crash(
     checkers = [Checker(f"127.0.0.1:{port}", ledger, seed + k) for k in range(checker_count)]
     for checker in checkers:
         checker.start()
-    kills = list(plan(kill_count, rng))
-    for kill, following in zip(kills, [*kills[1:], None], strict=True):
-        outcome.kills[kill.name if kill.strike(victim) else f"{kill.name} (not met)"] += 1
+    kills = deque(plan(kill_count, rng))
+    retry_count = RETRY_COUNT if kill_count >= 3 * len(FAILPOINTS) else 0
+    while kills:
+        kill = kills.popleft()
+        outcome.kills[kill.name if kill.strike(victim) else f"{kill.name}{NOT_MET}"] += 1
+        if not kills and retry_count:
+            retry_count -= 1
+            kills += (again for step in outcome.missed for again in _retries(step, rng))
+        following = kills[0].failpoint if kills else ""
         if victim.is_dead_within(0):
             outcome.broken += check_folder(folder).problems
-            victim = _restarted(
-                folder, port, log, outcome, following.failpoint if following else ""
-            )
-        if following is None or not following.failpoint:
+            victim = _restarted(folder, port, log, outcome, following)
+        if not following:
             with Client(f"127.0.0.1:{port}", retry=PATIENT, timeout_s=60.0) as client:
                 ledger.check(client)
     for checker in checkers:
@@ -122,8 +153,14 @@ def crash(
     outcome.ends.update(ledger.ends.values())
     outcome.event_count = sum(ledger.events.values())
     outcome.recording_count, outcome.map_count = len(ledger.digests), len(ledger.maps)
+    outcome.blob_count = len(ledger.blobs)
     outcome.seconds = time.monotonic() - began_s
     return outcome
+
+
+def _retries(step: str, rng: random.Random) -> tuple[Kill, Kill]:
+    """A step once more, with the server's death that has to come before it."""
+    return _kill_of_server(rng), _kill_at_step(step)
 
 
 def _unended(folder: Path, ledger: Ledger) -> list[str]:
@@ -158,12 +195,18 @@ def _after(life_s: float) -> Callable[[Victim], bool]:
     return strike
 
 
-def _at_step(victim: Victim) -> bool:
-    if victim.is_dead_within(STEP_TIMEOUT_S):
-        return True
-    victim.kill()
-    victim.is_dead_within(60)
-    return False
+def _at_step(step: str) -> Callable[[Victim], bool]:
+    """A server that dies there, or whose child does; it is killed in any case."""
+
+    def strike(victim: Victim) -> bool:
+        deadline_s = time.monotonic() + STEP_TIMEOUT_S
+        while not victim.has_met(step) and time.monotonic() < deadline_s:
+            time.sleep(0.05)
+        victim.kill()
+        victim.is_dead_within(60)
+        return victim.has_met(step)
+
+    return strike
 
 
 def _child_after(life_s: float) -> Callable[[Victim], bool]:

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import IO
 
-from roel_service.failpoints import VARIABLE
+from roel_service.failpoints import MET, VARIABLE
 
 
 class Victim:
@@ -19,10 +19,13 @@ class Victim:
     Args:
         folder: the data folder.
         port: 0 takes a free one.
+        log: a file, for what it and its children write to stderr.
         failpoint: as `ROEL_FAILPOINT`; its children have it too.
     """
 
     def __init__(self, folder: Path, port: int, log: IO[bytes], failpoint: str = "") -> None:
+        self._log = Path(log.name)
+        self._began_bytes = self._log.stat().st_size
         environment = {**os.environ, VARIABLE: failpoint}
         command = [sys.executable, "-m", "roel_crash.serve", str(folder), str(port)]
         self._process = subprocess.Popen(
@@ -45,6 +48,12 @@ class Victim:
             return False
         self._close()
         return True
+
+    def has_met(self, failpoint: str) -> bool:
+        """Whether it or one of its children died at a failpoint."""
+        with self._log.open("rb") as file:
+            file.seek(self._began_bytes)
+            return f"{MET} {failpoint}\n".encode() in file.read()
 
     def stop(self) -> int:
         """Drain it; the exit code."""
