@@ -1,4 +1,4 @@
-"""Recordings of events: HDF5, NPZ and text, told apart by their first bytes."""
+"""Recordings of events: HDF5, NPZ, RAW, DAT and text, told apart by their first bytes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from roel_service.io.event_columns import checked_streams
 from roel_service.io.events_hdf5 import Hdf5Events, write_events_hdf5
 from roel_service.io.events_npz import NpzEvents
+from roel_service.io.events_prophesee import HEADER_MARK, PropheseeEvents
 from roel_service.io.events_text import TextEvents
 from roel_service.io.files import open_input
 from roel_service.scene.events import EventStream, concatenate
@@ -17,6 +18,8 @@ __all__ = ["EventFile", "open_events", "read_events", "write_events_hdf5"]
 
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 _ZIP_MAGIC = b"PK\x03\x04"
+
+Columns = Hdf5Events | NpzEvents | PropheseeEvents | TextEvents
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +33,7 @@ class EventFile:
 
     width: int
     height: int
-    columns: Hdf5Events | NpzEvents | TextEvents
+    columns: Columns
 
     @property
     def event_count(self) -> int | None:
@@ -61,22 +64,25 @@ def open_events(path: Path, width: int, height: int, *, subject: str | None = No
     """Open a recording and check what can be known without reading it.
 
     Args:
-        path: HDF5, NPZ or text file.
+        path: HDF5, NPZ, RAW (EVT2, EVT3), DAT or text file.
         width, height: sensor size, px.
         subject: name of the recording in errors; the path by default.
 
     Raises:
         InputError: no readable file.
-        EventsError: no events, missing or unequal columns, damage, an unknown HDF5 filter.
+        EventsError: no events, missing or unequal columns, damage, an unknown HDF5 filter or
+            encoding.
     """
     subject = str(path) if subject is None else subject
     with open_input(path) as file:
         magic = file.read(len(_HDF5_MAGIC))
-    columns: Hdf5Events | NpzEvents | TextEvents
+    columns: Columns
     if magic == _HDF5_MAGIC:
         columns = Hdf5Events.open(path, subject)
     elif magic.startswith(_ZIP_MAGIC):
         columns = NpzEvents.open(path, subject)
+    elif magic.startswith(HEADER_MARK):
+        columns = PropheseeEvents.open(path, subject)
     else:
         columns = TextEvents(path=path, subject=subject)
     return EventFile(width=width, height=height, columns=columns)

@@ -28,6 +28,8 @@ CHOICES = {
     "match_global.method": MATCH_GLOBAL_METHODS,
     "match_global.matcher": MATCHERS,
     "triangulate.gate": TRIANGULATE_GATES,
+    "refine_rounds.residual": REFINE_RESIDUALS,
+    "refine_rounds.loss": REFINE_LOSSES,
     "refine.residual": REFINE_RESIDUALS,
     "refine.loss": REFINE_LOSSES,
     "trim.method": TRIM_METHODS,
