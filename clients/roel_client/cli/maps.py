@@ -71,7 +71,10 @@ def _add_build(group: Subparsers) -> None:
 def add_recording_options(parser: Parser) -> None:
     """The files that make up a recording."""
     parser.add_argument(
-        "--events", required=True, metavar="FILE", help="HDF5, NPZ, RAW (EVT2, EVT3), DAT, or text `t_seconds x y p`"
+        "--events",
+        required=True,
+        metavar="FILE",
+        help="HDF5, NPZ, RAW (EVT2, EVT3), DAT, or text `t_seconds x y p`",
     )
     parser.add_argument(
         "--poses", required=True, metavar="FILE", help="TUM text `t tx ty tz qx qy qz qw`"
