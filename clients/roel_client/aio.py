@@ -21,14 +21,23 @@ from google.protobuf.message import Message
 from roel_client.connection import AsyncConnection, AsyncExchange, Endpoint, Tls
 from roel_client.embedded import async_served
 from roel_client.retry import RESUMING, Attempts, RetryPolicy
-from roel_client.uploads import BlobDownload, BlobUpload, EventUpload, events_of_chunk
-from roel_service.arrays import Array
+from roel_client.uploads import (
+    BlobDownload,
+    BlobUpload,
+    EventUpload,
+    MapDownload,
+    events_of_chunk,
+    lines_of_message,
+    map_format,
+)
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
 from roel_service.errors import CorruptionError, RoelError
 from roel_service.geometry.se3 import SE3
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSlice, EventSource
+from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
 from roel_service.v1 import (
     blobs_pb2,
@@ -52,7 +61,12 @@ from roel_service.wire.configs import config_to_proto
 from roel_service.wire.delimited import delimited, messages
 from roel_service.wire.errors import error_from_status
 from roel_service.wire.localization import localize_request, prior_to_proto
-from roel_service.wire.nouns import camera_to_proto, trajectory_from_proto, trajectory_to_proto
+from roel_service.wire.nouns import (
+    bounds_to_proto,
+    camera_to_proto,
+    trajectory_from_proto,
+    trajectory_to_proto,
+)
 from roel_service.wire.registration import register_request
 from roel_service.wire.results import Report, progress_from_proto, report_from_proto
 
@@ -500,6 +514,107 @@ class AsyncClient:
         if found != version.map.sha256:
             raise CorruptionError(version.name, f"bytes of digest {version.map.sha256}", found)
         return data
+
+    async def export_map(self, name: str, path: Path, export_format: str) -> None:
+        """A version as a file: `rlm`, `npz`, `ply`, `obj`, `json`, `csv` or `dxf`."""
+        request = maps_pb2.ExportMapRequest(name=name, format=map_format(export_format))
+        download = MapDownload(path)
+        answers = self._connection.stream(self._maps.ExportMap, request)
+        try:
+            async with contextlib.aclosing(answers):
+                async for answer in answers:
+                    await self._connection.run(download.receive, answer)
+            download.finish()
+        finally:
+            download.close()
+
+    async def lines(
+        self,
+        name: str,
+        bounds_m: FloatArray | None = None,
+        *,
+        min_length_m: float = 0.0,
+        min_observation_count: int = 0,
+    ) -> AsyncIterator[LineMap]:
+        """The lines of a version that meet some conditions, in pieces.
+
+        Args:
+            name: of the version; its last part may be an alias.
+            bounds_m: (2, 3) corners of a box that a line must reach into; None for anywhere.
+        """
+        request = maps_pb2.GetLinesRequest(
+            name=name,
+            bounds=None if bounds_m is None else bounds_to_proto(*bounds_m),
+            min_length_m=min_length_m,
+            min_observation_count=min_observation_count,
+        )
+        answers = self._connection.stream(self._maps.GetLines, request)
+        async with contextlib.aclosing(answers):
+            async for answer in answers:
+                yield lines_of_message(answer)
+
+    async def map(self, name: str) -> maps_pb2.Map:
+        """A map without its lines: aliases, labels, etag."""
+        request = maps_pb2.GetMapRequest(name=name)
+        return await self._connection.call(self._maps.GetMap, request)
+
+    async def maps(self, *, show_deleted: bool = False) -> list[maps_pb2.Map]:
+        """All maps, in the order of their ids."""
+        found: list[maps_pb2.Map] = []
+        token: str | None = ""
+        while token is not None:
+            request = maps_pb2.ListMapsRequest(
+                parent=names.PROJECT, page_token=token, show_deleted=show_deleted
+            )
+            page = await self._connection.call(self._maps.ListMaps, request)
+            found += page.maps
+            token = page.next_page_token or None
+        return found
+
+    async def map_versions(self, map_name: str) -> list[maps_pb2.MapVersion]:
+        """All versions of a map, oldest first."""
+        found: list[maps_pb2.MapVersion] = []
+        token: str | None = ""
+        while token is not None:
+            request = maps_pb2.ListMapVersionsRequest(parent=map_name, page_token=token)
+            page = await self._connection.call(self._maps.ListMapVersions, request)
+            found += page.map_versions
+            token = page.next_page_token or None
+        return found
+
+    async def promote(self, version_name: str, alias: str, *, etag: str = "") -> maps_pb2.Map:
+        """Let an alias name a version; naming an older one than before rolls back."""
+        request = maps_pb2.PromoteMapVersionRequest(name=version_name, alias=alias, etag=etag)
+        return await self._connection.call(self._maps.PromoteMapVersion, request)
+
+    async def delete_alias(self, map_name: str, alias: str, *, etag: str = "") -> maps_pb2.Map:
+        """Let an alias name nothing."""
+        request = maps_pb2.DeleteMapAliasRequest(name=map_name, alias=alias, etag=etag)
+        return await self._connection.call(self._maps.DeleteMapAlias, request)
+
+    async def import_events(
+        self, stream: str, path: Path, progress: ProgressCallback = ignore
+    ) -> AsyncOperation:
+        """Upload a recording's file as it is, and begin to fill an empty recording from it."""
+        blob = await self.upload_blob(path, progress)
+        request = events_pb2.ImportEventStreamRequest(name=stream, blob=blob)
+        begun = await self._connection.call(self._streams.ImportEventStream, request)
+        return self.operation(begun.name)
+
+    async def delete_map_version(self, name: str) -> maps_pb2.MapVersion:
+        """Delete a version that no alias names; it can be undeleted."""
+        request = maps_pb2.DeleteMapVersionRequest(name=name)
+        return await self._connection.call(self._maps.DeleteMapVersion, request)
+
+    async def undelete_map_version(self, name: str) -> maps_pb2.MapVersion:
+        """Take the deletion of a version back."""
+        request = maps_pb2.UndeleteMapVersionRequest(name=name)
+        return await self._connection.call(self._maps.UndeleteMapVersion, request)
+
+    async def undelete_map(self, name: str) -> maps_pb2.Map:
+        """Take the deletion of a map back."""
+        request = maps_pb2.UndeleteMapRequest(name=name)
+        return await self._connection.call(self._maps.UndeleteMap, request)
 
     async def delete_map(self, name: str, *, purge: bool = False) -> None:
         """Delete a map with all its versions; it can be undeleted unless it is purged."""

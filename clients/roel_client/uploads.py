@@ -14,11 +14,14 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 
-from roel_service.errors import CorruptionError, UnavailableError
+import numpy as np
+
+from roel_service.errors import CorruptionError, InputError, UnavailableError
 from roel_service.in_order import in_order
 from roel_service.progress import Progress, ProgressCallback
 from roel_service.scene.events import EventSlice, EventSource, EventStream
-from roel_service.v1 import blobs_pb2, events_pb2, types_pb2
+from roel_service.scene.lines import LineMap
+from roel_service.v1 import blobs_pb2, events_pb2, maps_pb2, types_pb2
 from roel_service.wire import names
 from roel_service.wire.chunks import decode_chunk, encode_chunk, split_chunks
 
@@ -215,6 +218,55 @@ class BlobDownload:
     def close(self) -> None:
         """Leave nothing half behind."""
         self._part.unlink(missing_ok=True)
+
+
+class MapDownload:
+    """A map version on its way into a file, which appears when it is whole."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._part = path.with_name(f"{path.name}.part")
+        self._missing_bytes = 0
+        self._part.write_bytes(b"")
+
+    def receive(self, response: maps_pb2.ExportMapResponse) -> None:
+        """The next bytes came; the first message tells how many there will be."""
+        self._missing_bytes += response.size_bytes - len(response.data)
+        with self._part.open("ab") as file:
+            file.write(response.data)
+
+    def finish(self) -> None:
+        """Give the file its name; raises `UnavailableError` if something is missing."""
+        if self._missing_bytes:
+            found = f"{self._missing_bytes} bytes less"
+            raise UnavailableError("export", "the whole file", found)
+        self._part.replace(self._path)
+
+    def close(self) -> None:
+        """Leave nothing half behind."""
+        self._part.unlink(missing_ok=True)
+
+
+def map_format(name: str) -> int:
+    """The number of an export format by its suffix; raises `InputError` for an unknown one."""
+    numbers: dict[str, int] = {
+        key.removeprefix("MAP_FORMAT_").lower(): number
+        for key, number in maps_pb2.MapFormat.items()
+    }
+    known = [key for key, number in numbers.items() if number]
+    if name not in known:
+        raise InputError("format", f"one of {', '.join(known)}", repr(name[:40]))
+    return numbers[name]
+
+
+def lines_of_message(message: maps_pb2.GetLinesResponse) -> LineMap:
+    """The lines of one message of GetLines."""
+    return LineMap(
+        segments=np.frombuffer(message.segments_m, "<f8").reshape(-1, 2, 3),
+        observation_count=np.frombuffer(message.observation_count, "<i4"),
+        rms_residual_px=np.frombuffer(message.rms_residual_px, "<f4"),
+        sigma_m=np.frombuffer(message.sigma_m, "<f4"),
+    )
 
 
 def events_of_chunk(

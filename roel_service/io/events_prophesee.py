@@ -122,7 +122,7 @@ class _Clock:
         unwrapped = counts + turns * self._period
         if len(unwrapped):
             self._last = int(unwrapped[-1])
-        return unwrapped
+        return np.asarray(unwrapped)
 
 
 def _decoded_dat(words: Array, clock: _Clock) -> tuple[EventColumns, Array]:
@@ -204,7 +204,7 @@ def _held_evt3(
         (index,) = last_base
         moved = int(words[index] & 0x7FF) + int(covered[-1] + sizes[-1] - covered[index])
         kept[held == index] = words[index] & 0xF800 | min(moved, 0x7FF)
-    return kept
+    return np.asarray(kept)
 
 
 def _latest(is_kind: Array) -> tuple[IntArray, IntArray]:

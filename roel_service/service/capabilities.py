@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from roel_service import __version__
@@ -13,18 +15,20 @@ from roel_service.io.maps import EXPORT_FORMATS
 from roel_service.scene.results import MAPPING_STAGES
 from roel_service.service.methods import is_implemented, method_name
 from roel_service.service.settings import Settings
+from roel_service.store.store import Store
 from roel_service.v1 import capabilities_pb2
 from roel_service.wire import chunks, rlm
 
 
 class CapabilitiesServicer:
-    """Answers from the settings, the code and the servicers.
+    """Answers from the settings, the code, the servicers and the store.
 
     Args:
         servicers: what answers each service, by its descriptor; this one is among them.
     """
 
-    def __init__(self, settings: Settings, servicers: Mapping[Any, object]) -> None:
+    def __init__(self, store: Store, settings: Settings, servicers: Mapping[Any, object]) -> None:
+        self._store = store
         self._settings = settings
         self._servicers = servicers
 
@@ -46,6 +50,7 @@ class CapabilitiesServicer:
             detectors=DETECTORS,
             matchers=MATCHERS,
             methods=self._methods(),
+            usage=capabilities_pb2.Usage(**asdict(await asyncio.to_thread(self._store.usage))),
         )
 
     def _methods(self) -> list[capabilities_pb2.Method]:

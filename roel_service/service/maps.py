@@ -176,6 +176,26 @@ class MapServicer:
         record = await asyncio.to_thread(delete, map_id, number, request_id(request))
         return map_version_to_proto(record)
 
+    async def UndeleteMapVersion(
+        self, request: maps_pb2.UndeleteMapVersionRequest, context: Any
+    ) -> maps_pb2.MapVersion:
+        map_id, number = names.map_version_number(request.name)
+        undelete = self._store.maps.undelete_version
+        record = await asyncio.to_thread(undelete, map_id, number, request_id(request))
+        return map_version_to_proto(record)
+
+    async def DeleteMapAlias(
+        self, request: maps_pb2.DeleteMapAliasRequest, context: Any
+    ) -> maps_pb2.Map:
+        record = await asyncio.to_thread(
+            self._store.maps.remove_alias,
+            names.map_id(request.name),
+            names.checked_alias(request.alias),
+            etag=request.etag,
+            request=request_id(request),
+        )
+        return map_to_proto(record)
+
     async def PromoteMapVersion(
         self, request: maps_pb2.PromoteMapVersionRequest, context: Any
     ) -> maps_pb2.Map:

@@ -92,6 +92,8 @@ _METHODS: dict[str, dict[Rule, tuple[str, ...]]] = {
             "RefinePoses",
             "ImportMap",
             "DeleteMapVersion",
+            "UndeleteMapVersion",
+            "DeleteMapAlias",
             "PromoteMapVersion",
         ),
     },

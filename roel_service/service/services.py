@@ -119,7 +119,7 @@ def add_services(
         "Operations": operations,
     }
     answered = {descriptor: servicers.get(name) for name, descriptor in _DESCRIPTORS.items()}
-    capabilities = CapabilitiesServicer(settings, answered)
+    capabilities = CapabilitiesServicer(store, settings, answered)
     answered[_DESCRIPTORS["CapabilitiesService"]] = capabilities
     for descriptor, servicer in answered.items():
         _, add = _DECLARED[descriptor.name]

@@ -140,10 +140,15 @@ def check_unused(connection: Connection, map_id: str, version: int | None = None
 
 def set_alias(connection: Connection, map_id: str, alias: str, version: int) -> None:
     """Let an alias name a version, whatever it named before."""
-    key = (MAP_ALIAS.c.map_id == map_id) & (MAP_ALIAS.c.alias == alias)
-    connection.execute(delete(MAP_ALIAS).where(key))
+    delete_alias(connection, map_id, alias)
     row = {"map_id": map_id, "alias": alias, "version": version}
     connection.execute(insert(MAP_ALIAS), row)
+
+
+def delete_alias(connection: Connection, map_id: str, alias: str) -> None:
+    """Let an alias name nothing; one that names nothing is fine."""
+    key = (MAP_ALIAS.c.map_id == map_id) & (MAP_ALIAS.c.alias == alias)
+    connection.execute(delete(MAP_ALIAS).where(key))
 
 
 def change_version(

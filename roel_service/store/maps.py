@@ -12,7 +12,7 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, select
 
-from roel_service.errors import LimitError, StateError
+from roel_service.errors import LimitError, NotFoundError, StateError
 from roel_service.store.blobs import BlobStore
 from roel_service.store.database import Database
 from roel_service.store.etags import check_etag
@@ -22,6 +22,7 @@ from roel_service.store.map_rows import (
     change_version,
     check_state,
     check_unused,
+    delete_alias,
     find_map,
     forget_map,
     get_current_map,
@@ -201,6 +202,27 @@ class Maps:
 
         return self._changed(request, act)
 
+    def remove_alias(
+        self, map_id: str, alias: str, *, etag: str = "", request: RequestId | None = None
+    ) -> MapRecord:
+        """Let an alias name nothing.
+
+        Raises:
+            NotFoundError: no such alias.
+            StateError: MAP_DELETED.
+            ConflictError: ETAG_MISMATCH.
+        """
+
+        def act(connection: Connection) -> MapRecord:
+            record = get_current_map(connection, map_id, etag)
+            if alias not in record.aliases:
+                raise NotFoundError("alias", "an existing one", alias)
+            delete_alias(connection, map_id, alias)
+            change_map(connection, record, {})
+            return find_map(connection, map_id)
+
+        return self._changed(request, act)
+
     def version(self, map_id: str, label: int | str) -> MapVersionRecord:
         """One version by its number or an alias; raises `NotFoundError`, `StateError` MAP_DELETED."""
         with self._database.read() as connection:
@@ -244,11 +266,35 @@ class Maps:
                 reason = "VERSION_HAS_ALIAS"
                 raise StateError(subject, "a version without alias", found, reason=reason)
             purge_time_us = now_us() + DELETED_MAP_RETENTION_DAYS * DAY_US
-            changes = {"state": VersionState.DELETED, "purge_time_us": purge_time_us}
+            changes = {
+                "state": VersionState.DELETED,
+                "deleted_state": version.state.value,
+                "purge_time_us": purge_time_us,
+            }
             return change_version(connection, version, changes)
 
-        with self._database.write() as connection:
-            return once(connection, request, _VERSION_MEMORY, partial(act, connection))
+        return self._changed_version(request, act)
+
+    def undelete_version(
+        self, map_id: str, number: int, request: RequestId | None
+    ) -> MapVersionRecord:
+        """Take the deletion of a version back.
+
+        Raises:
+            StateError: MAP_DELETED; MAP_NOT_DELETED for a version that is not.
+        """
+
+        def act(connection: Connection) -> MapVersionRecord:
+            version = get_version(connection, get_map(connection, map_id), number)
+            if not version.deleted_state:
+                subject = f"{map_id} v{version.version}"
+                reason = "MAP_NOT_DELETED"
+                raise StateError(subject, "a deleted version", version.state.value, reason=reason)
+            state = VersionState(version.deleted_state)
+            changes = {"state": state, "deleted_state": "", "purge_time_us": 0}
+            return change_version(connection, version, changes)
+
+        return self._changed_version(request, act)
 
     def map_file(self, record: MapVersionRecord) -> bytes:
         """The map file of a usable version; raises `StateError` MAP_NOT_ACTIVE."""
@@ -273,6 +319,12 @@ class Maps:
                 forget_map(connection, map_id)
             versions = MAP_VERSION.c.purge_time_us.between(1, now)
             connection.execute(delete(MAP_VERSION).where(versions))
+
+    def _changed_version(
+        self, request: RequestId | None, act: Callable[[Connection], MapVersionRecord]
+    ) -> MapVersionRecord:
+        with self._database.write() as connection:
+            return once(connection, request, _VERSION_MEMORY, partial(act, connection))
 
     def _changed(
         self, request: RequestId | None, act: Callable[[Connection], MapRecord]

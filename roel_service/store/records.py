@@ -147,6 +147,7 @@ class MapVersionRecord:
         provenance: what the map was made of.
         purge_time_us: when a deleted version will be forgotten; 0 for any other.
         trajectory_sha256, trajectory_bytes: its poses, if they were refined with its lines.
+        deleted_state: in which state it was deleted; empty for any other.
     """
 
     map_id: str
@@ -165,6 +166,7 @@ class MapVersionRecord:
     purge_time_us: int = 0
     trajectory_sha256: str = ""
     trajectory_bytes: int = 0
+    deleted_state: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

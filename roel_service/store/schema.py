@@ -105,6 +105,7 @@ MAP_VERSION = Table(
     Column("purge_time_us", BigInteger, nullable=False),
     Column("trajectory_sha256", String, nullable=False),
     Column("trajectory_bytes", BigInteger, nullable=False),
+    Column("deleted_state", String, nullable=False),
 )
 
 OPERATION = Table(

@@ -31,6 +31,7 @@ from roel_service.store.refinements import RefinementCompletion, Refinements
 from roel_service.store.requests import delete_expired_requests
 from roel_service.store.tasks import Tasks
 from roel_service.store.uploads import Uploads
+from roel_service.store.usage import Usage, usage_of
 
 # A row has some 150 bytes.
 AUDIT_ROW_COUNT = 1_000_000
@@ -111,6 +112,10 @@ class Store:
         with self._database.write() as connection:
             delete_expired_requests(connection)
         return sweep_blobs(self._database, self._blobs, unused_for_s)
+
+    def usage(self) -> Usage:
+        """How much the folder holds, and how much is going on."""
+        return usage_of(self._database)
 
     def problems(self) -> list[str]:
         """What keeps the store from working, a sentence each."""

@@ -97,6 +97,16 @@ class MapServiceStub:
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.SerializeToString,
                 response_deserializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
                 _registered_method=True)
+        self.UndeleteMapVersion = channel.unary_unary(
+                '/roel_service.v1.MapService/UndeleteMapVersion',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.UndeleteMapVersionRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
+                _registered_method=True)
+        self.DeleteMapAlias = channel.unary_unary(
+                '/roel_service.v1.MapService/DeleteMapAlias',
+                request_serializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapAliasRequest.SerializeToString,
+                response_deserializer=roel__service_dot_v1_dot_maps__pb2.Map.FromString,
+                _registered_method=True)
         self.PromoteMapVersion = channel.unary_unary(
                 '/roel_service.v1.MapService/PromoteMapVersion',
                 request_serializer=roel__service_dot_v1_dot_maps__pb2.PromoteMapVersionRequest.SerializeToString,
@@ -209,6 +219,20 @@ class MapServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def UndeleteMapVersion(self, request, context):
+        """Takes the deletion of a version back, while it is remembered.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def DeleteMapAlias(self, request, context):
+        """Lets an alias name nothing any more.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def PromoteMapVersion(self, request, context):
         """Lets an alias name a version; naming an older one than before is a rollback.
         """
@@ -299,6 +323,16 @@ def add_MapServiceServicer_to_server(servicer, server):
                     servicer.DeleteMapVersion,
                     request_deserializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.FromString,
                     response_serializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.SerializeToString,
+            ),
+            'UndeleteMapVersion': grpc.unary_unary_rpc_method_handler(
+                    servicer.UndeleteMapVersion,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.UndeleteMapVersionRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.MapVersion.SerializeToString,
+            ),
+            'DeleteMapAlias': grpc.unary_unary_rpc_method_handler(
+                    servicer.DeleteMapAlias,
+                    request_deserializer=roel__service_dot_v1_dot_maps__pb2.DeleteMapAliasRequest.FromString,
+                    response_serializer=roel__service_dot_v1_dot_maps__pb2.Map.SerializeToString,
             ),
             'PromoteMapVersion': grpc.unary_unary_rpc_method_handler(
                     servicer.PromoteMapVersion,
@@ -647,6 +681,60 @@ class MapService:
             '/roel_service.v1.MapService/DeleteMapVersion',
             roel__service_dot_v1_dot_maps__pb2.DeleteMapVersionRequest.SerializeToString,
             roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def UndeleteMapVersion(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/UndeleteMapVersion',
+            roel__service_dot_v1_dot_maps__pb2.UndeleteMapVersionRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.MapVersion.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def DeleteMapAlias(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/roel_service.v1.MapService/DeleteMapAlias',
+            roel__service_dot_v1_dot_maps__pb2.DeleteMapAliasRequest.SerializeToString,
+            roel__service_dot_v1_dot_maps__pb2.Map.FromString,
             options,
             channel_credentials,
             insecure,

@@ -19,6 +19,7 @@ from roel_service.store.migrations import (
     m006_uploads,
     m007_principals,
     m008_results,
+    m009_undeleted_versions,
 )
 
 # Step k leads from version k to k + 1.
@@ -31,6 +32,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m006_uploads.migrate,
     m007_principals.migrate,
     m008_results.migrate,
+    m009_undeleted_versions.migrate,
 )
 
 
