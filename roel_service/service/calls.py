@@ -73,16 +73,22 @@ class Call:
             self.operation = message.name
 
 
+# With which status a call of a method is refused before it is looked at; None lets it through.
+Gate = Callable[[str], Any]
+
 # Entered before a call and left after it; raises to refuse the call, and sees how the call ended.
 Guard = Callable[[Call], AbstractAsyncContextManager[None]]
 
 
 @grpc.aio.ServerInterceptor.register
 class GuardInterceptor:
-    """Leads every call of ours through the guards, in their order."""
+    """Leads every call of ours through the gate, then through the guards, in their order."""
 
-    def __init__(self, guards: Sequence[Guard]) -> None:
+    def __init__(self, gate: Gate, guards: Sequence[Guard]) -> None:
+        self._gate = gate
         self._guards = tuple(guards)
+        # Handlers by method, with what leads their calls: made once, not for each call.
+        self._led: dict[str, tuple[Any, Any]] = {}
 
     async def intercept_service(
         self, continuation: Callable[[Any], Awaitable[Any]], details: Any
@@ -91,9 +97,17 @@ class GuardInterceptor:
         handler = await continuation(details)
         if handler is None or not details.method.startswith(OUR_METHODS):
             return handler
+        known, led = self._led.get(details.method, (None, None))
+        if known is not handler:
+            led = self._leading(handler, details.method)
+            self._led[details.method] = (handler, led)
+        return led
+
+    def _leading(self, handler: Any, method: str) -> Any:
+        """The handler with its behavior behind gate and guards."""
         wrap = self._streaming if handler.response_streaming else self._single
         behaviors = {
-            name: wrap(behavior, details.method)
+            name: wrap(behavior, method)
             for name in ("unary_unary", "unary_stream", "stream_unary", "stream_stream")
             if (behavior := getattr(handler, name)) is not None
         }
@@ -101,6 +115,8 @@ class GuardInterceptor:
 
     def _single(self, behavior: Behavior, method: str) -> Behavior:
         async def guarded(request: Any, context: Any) -> Any:
+            if (refusal := self._gate(method)) is not None:
+                await context.abort_with_status(refusal)
             call = _call(method, context)
             seen = _seen(request, call)
             async with AsyncExitStack() as entered:
@@ -113,6 +129,8 @@ class GuardInterceptor:
 
     def _streaming(self, behavior: Behavior, method: str) -> Behavior:
         async def guarded(request: Any, context: Any) -> AsyncIterator[Any]:
+            if (refusal := self._gate(method)) is not None:
+                await context.abort_with_status(refusal)
             call = _call(method, context)
             seen = _seen(request, call)
             async with AsyncExitStack() as entered:

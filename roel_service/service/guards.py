@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import defaultdict
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, nullcontext
 from typing import Any
 
@@ -112,6 +112,14 @@ class CallLimits:
             lambda: Places(settings.calls_in_flight, settings.calls_waiting)
         )
 
+    def is_full(self, method: str) -> bool:
+        """Whether one more call would be refused."""
+        return rule_of(method).pool is Pool.METHOD and self._methods[method].is_full
+
+    def refusal(self, method: str) -> LimitError:
+        """What is told to a call of a method that is full."""
+        return self._methods[method].refusal(method)
+
     @asynccontextmanager
     async def __call__(self, call: Call) -> AsyncIterator[None]:
         """Guard one call."""
@@ -128,6 +136,32 @@ class CallLimits:
             place = self._methods[call.method].taken(call)
         async with place:
             yield
+
+
+class FullMethods:
+    """The gate before all guards: refuses calls of a method that has no room, at next to no cost.
+
+    Most of what a refusal costs is telling it, so that its status is made once for each method; it
+    carries no request id, and the log does not mention it.
+
+    Args:
+        note: is told of the method and how the call ended.
+    """
+
+    def __init__(self, limits: CallLimits, note: Callable[[str, str], None]) -> None:
+        self._limits = limits
+        self._note = note
+        self._statuses: dict[str, Any] = {}
+
+    def __call__(self, method: str) -> Any:
+        """The status with which a call is refused, None for one that is let through."""
+        if not self._limits.is_full(method):
+            return None
+        self._note(method, "RESOURCE_EXHAUSTED")
+        if method not in self._statuses:
+            status = status_from_error(self._limits.refusal(method))
+            self._statuses[method] = rpc_status.to_status(status)
+        return self._statuses[method]
 
 
 class Places:
@@ -147,6 +181,16 @@ class Places:
         self._room_count = working_count + waiting_count
         self._taken_count = 0
         self._mean_s = 0.0
+
+    @property
+    def is_full(self) -> bool:
+        """Whether nobody else may even wait."""
+        return self._taken_count >= self._room_count
+
+    def refusal(self, method: str) -> LimitError:
+        """What is told to a call for which there is no room."""
+        expected = f"at most {self._room_count} calls at a time"
+        return LimitError(method, expected, "one more", reason="QUEUE_FULL")
 
     @asynccontextmanager
     async def taken(self, call: Call) -> AsyncIterator[None]:
@@ -171,9 +215,8 @@ class Places:
             self._taken_count -= 1
 
     def _check(self, call: Call) -> None:
-        if self._taken_count >= self._room_count:
-            expected = f"at most {self._room_count} calls at a time"
-            raise LimitError(call.method, expected, "one more", reason="QUEUE_FULL")
+        if self.is_full:
+            raise self.refusal(call.method)
         waiting_count = max(0, self._taken_count + 1 - self._working_count)
         wait_s = self._mean_s * waiting_count / self._working_count
         if call.end_s is None:

@@ -99,6 +99,11 @@ class Metrics:
             ),
         )
 
+    def note_refused(self, method: str, code: str) -> None:
+        """Count a call that was refused before it was looked at."""
+        self.started.add(method)
+        self.handled.add(method, code)
+
     def note_end(self, record: OperationRecord) -> None:
         """Count an operation that ended."""
         method = record.method.value

@@ -76,12 +76,15 @@ def map_to_proto(record: MapRecord) -> maps_pb2.Map:
         uid=record.uid,
         version_count=record.version_count,
         display_name=record.display_name,
-        labels=record.labels,
-        aliases={alias: f"v{version}" for alias, version in record.aliases.items()},
         etag=record.etag,
         create_time=_timestamp(record.create_time_us),
         update_time=_timestamp(record.update_time_us),
     )
+    # Entry by entry: as arguments the two maps would take more time than all the rest.
+    for key, value in record.labels.items():
+        message.labels[key] = value
+    for alias, version in record.aliases.items():
+        message.aliases[alias] = f"v{version}"
     if record.is_deleted:
         message.delete_time.CopyFrom(_timestamp(record.delete_time_us))
         message.purge_time.CopyFrom(_timestamp(record.purge_time_us))

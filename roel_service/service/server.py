@@ -32,7 +32,7 @@ from roel_service.service.admin import Probes, admin_server
 from roel_service.service.asking import PRELOAD, Asking
 from roel_service.service.calls import Guard, GuardInterceptor
 from roel_service.service.exports import Exporter
-from roel_service.service.guards import CallLimits, Drain, told_errors
+from roel_service.service.guards import CallLimits, Drain, FullMethods, told_errors
 from roel_service.service.listen import Listen
 from roel_service.service.observe import Auditing, Metrics, Observation
 from roel_service.service.services import SERVICES, add_services
@@ -114,7 +114,7 @@ async def running(
         scheduler = _scheduler(store, settings, metrics)
         await scheduler.start()
         server = grpc.aio.server(
-            interceptors=[GuardInterceptor(_guards(store, settings, drain, metrics))],
+            interceptors=[_interceptor(store, settings, drain, metrics)],
             options=_options(settings),
             compression=None,
         )
@@ -185,17 +185,21 @@ def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:
     )
 
 
-def _guards(store: Store, settings: Settings, drain: Drain, metrics: Metrics) -> list[Guard]:
-    """Around every call, the outermost first."""
-    return [
+def _interceptor(
+    store: Store, settings: Settings, drain: Drain, metrics: Metrics
+) -> GuardInterceptor:
+    """The gate before every call and the guards around it, the outermost first."""
+    limits = CallLimits(settings)
+    guards: list[Guard] = [
         told_errors,
         Observation(metrics),
         drain,
         # Before anything is looked up: refusing must cost less than answering.
-        CallLimits(settings),
+        limits,
         Auditing(store.audit),
         Access(store.principals),
     ]
+    return GuardInterceptor(FullMethods(limits, metrics.note_refused), guards)
 
 
 def _problems(store: Store, drain: Drain) -> list[str]:

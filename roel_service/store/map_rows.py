@@ -50,7 +50,7 @@ def map_records(connection: Connection, query: Select[Any]) -> list[MapRecord]:
     """The maps of a query for whole rows in the order of ids, with their aliases."""
     # By position: a mapping for each row would take as long as all the rest.
     names = MAP.c.keys()
-    rows = [dict(zip(names, row, strict=True)) for row in connection.execute(query)]
+    rows = [dict(zip(names, row, strict=True)) for row in connection.execute(query).all()]
     if not rows:
         return []
     aliases = _aliases_between(connection, rows[0]["id"], rows[-1]["id"])

@@ -3,11 +3,12 @@
 import asyncio
 from contextlib import asynccontextmanager
 
+import grpc
 import pytest
 
 from roel_service.errors import DeadlineError, LimitError, UnavailableError
 from roel_service.service.calls import Call
-from roel_service.service.guards import CallLimits, Drain
+from roel_service.service.guards import CallLimits, Drain, FullMethods
 from roel_service.service.settings import Settings
 
 GET = "/roel_service.v1.MapService/GetMap"
@@ -181,5 +182,26 @@ def test_a_cancelled_call_stays_cancelled():
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task
+
+    asyncio.run(main())
+
+
+def test_a_full_method_is_refused_before_the_guards_with_one_status():
+    async def main():
+        limits, noted = CallLimits(SETTINGS), []
+        gate = FullMethods(limits, lambda *told: noted.append(told))
+        async with working(limits) as work:
+            assert gate(GET) is None
+            tasks = [work.start(method) for method in (GET, GET, WATCH, WATCH)]
+            await settled()
+            status = gate(GET)
+            assert status.code is grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert gate(GET) is status
+            assert gate(LIST) is None
+            assert gate(WATCH) is None
+            work.end.set()
+            await asyncio.gather(*tasks)
+        assert gate(GET) is None
+        assert noted == [(GET, "RESOURCE_EXHAUSTED")] * 2
 
     asyncio.run(main())
