@@ -90,7 +90,7 @@ def test_a_file_of_events_becomes_a_recording(client, tmp_path):
     path = tmp_path / "events.h5"
     write_events_hdf5(path, [events])
     stream = client.create_event_stream(new_id(), CAMERA)
-    record = client.import_events(stream, path).wait_for_events()
+    record = client.import_events(stream, path).wait()
     assert (record.name, record.event_count) == (stream, 5000)
     uploaded = client.create_event_stream(new_id(), CAMERA)
     client.upload_events(uploaded, events)
