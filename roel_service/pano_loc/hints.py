@@ -6,14 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import FloatArray, frozen_array
-from roel_service.geometry.se3 import SE3
+from roel_service.arrays import BoolArray, FloatArray, frozen_array
+from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.geometry.vectors import norm
 
 # Maps that may be asked for one picture.
 MAX_MAP_COUNT = 8
 DEFAULT_REACH_M, DEFAULT_REACH_RAD = 1.0, float(np.deg2rad(30.0))
 DEFAULT_UP_SIGMA_RAD = float(np.deg2rad(3.0))
+# What is found from within reach may lie so far beyond it.
+REACH_SLACK_M, REACH_SLACK_RAD = 0.1, float(np.deg2rad(2.0))
 # Orientations stay within so many deviations of gravity, and never closer than this.
 UP_REACH_SIGMAS, MIN_UP_REACH_RAD = 3.0, float(np.deg2rad(5.0))
 
@@ -30,6 +32,15 @@ class PosePrior:
     T_world_picture: SE3
     reach_m: float = DEFAULT_REACH_M
     reach_rad: float = DEFAULT_REACH_RAD
+
+    def holds(self, poses: SE3) -> BoolArray:
+        """(C,) which of C poses are within reach, or hardly beyond it."""
+        shift_m = norm(poses.translation - self.T_world_picture.translation)
+        turn_rad = rotation_angle(poses.rotation @ self.T_world_picture.rotation.T)
+        return np.asarray(
+            (shift_m <= self.reach_m + REACH_SLACK_M)
+            & (turn_rad <= self.reach_rad + REACH_SLACK_RAD)
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -101,6 +101,8 @@ def _searched(
         return Found(hypotheses=(), rotation_count=0, candidate_count=0)
     candidates = coarse_candidates(arcs, prepared, rotations, config, prior)
     refined = refine_poses(candidates, arcs, prepared, config)
+    if prior is not None:
+        refined = refined.take(prior.holds(refined.poses))
     return Found(
         hypotheses=hypotheses(refined, arcs, prepared, map_index),
         rotation_count=len(rotations),

@@ -65,17 +65,19 @@ def _aligned_pairs(seen: FloatArray, shared: FloatArray) -> FloatArray:
     """Rotations that lay two seen directions on two of the map's, with all signs."""
     rotations = []
     between_rad = np.arccos(np.clip(shared @ shared.T, -1.0, 1.0))
+    pairs = np.argwhere(~np.eye(len(shared), dtype=bool))
+    targets = np.array([_frame(shared[k], shared[m]) for k, m in pairs]).reshape(-1, 3, 3)
+    target_rad = between_rad[tuple(pairs.T)]
     for i, j in zip(*np.triu_indices(len(seen), k=1), strict=True):
         for sign in (1.0, -1.0):
-            pair = (seen[i], sign * seen[j])
-            angle_rad = np.arccos(np.clip(pair[0] @ pair[1], -1.0, 1.0))
+            first, second = seen[i], sign * seen[j]
+            angle_rad = np.arccos(np.clip(first @ second, -1.0, 1.0))
             if not MIN_PAIR_RAD < angle_rad < np.pi - MIN_PAIR_RAD:
                 continue
-            for k, m in np.argwhere(np.abs(between_rad - angle_rad) <= PAIR_TOLERANCE_RAD):
-                target = _frame(shared[k], shared[m])
-                rotations.append(target.T @ _frame(*pair))
-                rotations.append(target.T @ _frame(-pair[0], -pair[1]))
-    return np.array(rotations).reshape(-1, 3, 3)
+            alike = targets[np.abs(target_rad - angle_rad) <= PAIR_TOLERANCE_RAD]
+            for ahead in (_frame(first, second), _frame(-first, -second)):
+                rotations.append(alike.transpose(0, 2, 1) @ ahead)
+    return np.concatenate([np.empty((0, 3, 3)), *rotations])
 
 
 def _frame(first: FloatArray, second: FloatArray) -> FloatArray:

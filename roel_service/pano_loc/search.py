@@ -14,12 +14,14 @@ from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.prepare import BEARING_COUNT, PreparedMap
 from roel_service.pano_loc.views import agreement, pane_of, views_from, widest
 
-# Places within reach of a prior are tried at this spacing.
-PRIOR_STEP_M = 0.25
+# Places within reach of a prior are tried at this spacing, and so much fewer candidates stay.
+PRIOR_STEP_M, PRIOR_CANDIDATE_SHARE = 0.25, 1 / 3
 # Places of one orientation, so far apart.
 PLACES_PER_ROTATION = 6
 SUPPRESSION_M = 0.5
 CONSIDERED_PLACE_COUNT = 60
+# Beyond chance, and by likelihood: the columns of `agreement`.
+RANKINGS = (0, 1)
 # Rounds around the best: the share of the candidates that takes part, and how much finer the grid.
 ROUNDS = ((1.0, 3), (0.35, 3), (0.35, 9))
 FINE_LINE_COUNT, FINE_BEARING_COUNT = 300, 360
@@ -94,18 +96,20 @@ def coarse_candidates(
     a prior, places within its reach are tried.
     """
     places, step_m, views = prepared.places, prepared.step_m, prepared.views
+    candidate_count = config.candidate_count / len(RANKINGS)
     if prior is not None:
         step_m = PRIOR_STEP_M
+        candidate_count *= PRIOR_CANDIDATE_SHARE
         places = _ball(prior.reach_m, step_m) + prior.T_world_picture.translation
         views = views_from(prepared.lines, places, BEARING_COUNT)
     frames = prepared.lines.frames
     panes = [pane_of(arcs, rotation, frames, step_m, BEARING_COUNT) for rotation in rotations]
     scores = agreement(views, panes)
     found = []
-    for kind in range(scores.shape[2]):
+    for kind in RANKINGS:
         seeds = _best_of_all(places, scores[:, :, kind])
         for share, finer in ROUNDS:
-            seeds = seeds.best(round(share * config.candidate_count / scores.shape[2]))
+            seeds = seeds.best(max(1, round(share * candidate_count)))
             seeds = _moved(seeds, kind, arcs, prepared, rotations, step_m / finer)
         found.append(seeds)
     rotation = np.concatenate([seeds.rotation for seeds in found])

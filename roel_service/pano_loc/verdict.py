@@ -103,7 +103,8 @@ def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig)
     if not searched:
         reason: NoPoseReason | None = NoPoseReason.INSUFFICIENT_LINES
     elif not found:
-        reason = NoPoseReason.DEGENERATE
+        tried = any(one.candidate_count for one in searched)
+        reason = NoPoseReason.NOT_IN_MAP if tried else NoPoseReason.DEGENERATE
     else:
         reason = _reason(found[0], margin, config)
     status = {

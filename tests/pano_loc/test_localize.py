@@ -113,6 +113,18 @@ def test_a_prior_far_from_the_truth_is_not_left(room):
     arcs = seen_from(pose(1.7, 1.5, 1.4, 0, 0, 2.5), segments_of())
     result = localize_arcs(arcs, [room], CONFIG, prior=prior)
     assert result.status is LocalizationStatus.NOT_FOUND
+    assert result.reason is NoPoseReason.NOT_IN_MAP
+
+
+def test_poses_are_held_within_reach_of_a_prior():
+    prior = PosePrior(T_world_picture=POSES[1], reach_m=0.5, reach_rad=0.3)
+    steps = np.array([[0.2, 0, 0, 0.4, 0, 0], [0.5, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0.7, 0]])
+    poses = [POSES[1].retract(step) for step in steps]
+    batch = SE3(
+        rotation=np.array([item.rotation for item in poses]),
+        translation=np.array([item.translation for item in poses]),
+    )
+    assert prior.holds(batch).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("count", [0, 5])
