@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -75,6 +75,15 @@ class PreparedMap:
 
     def __len__(self) -> int:
         return len(self.segments)
+
+    def longest(self, count: int) -> PreparedMap:
+        """The same with fewer lines to match."""
+        return replace(
+            self,
+            segments=self.segments[:count],
+            directions=self.directions[:count],
+            channel=self.channel[:count],
+        )
 
     def to_arrays(self) -> Arrays:
         """For keeping it; under a name that `preparation_key` gives."""

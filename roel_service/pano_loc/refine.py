@@ -24,7 +24,7 @@ FINAL_GATE_RAD = np.deg2rad(5.0)
 FINAL_WIDTHS_RAD = np.deg2rad([0.7, 0.5, 0.5, 0.5])
 # The same for more of the modes, on fewer arcs.
 MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
-MODE_ARC_COUNT, MODE_STEP_RAD = 200, np.deg2rad(6.0)
+MODE_ARC_COUNT, MODE_LINE_COUNT, MODE_STEP_RAD = 200, 600, np.deg2rad(6.0)
 # Width of the kernel of a pose's score.
 SCORE_WIDTH_RAD = np.deg2rad(0.7)
 SCORE_GATE_RAD = np.deg2rad(6.0)
@@ -70,7 +70,8 @@ def refine_poses(
 ) -> Candidates:
     """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
-    modes = _refined(distinct(candidates, MODE_COUNT), few, prepared, MODE_WIDTHS_RAD)
+    long = prepared.longest(MODE_LINE_COUNT)
+    modes = _refined(distinct(candidates, MODE_COUNT), few, long, MODE_WIDTHS_RAD)
     samples = sample_arcs(arcs, FINAL_STEP_RAD)
     best = distinct(modes, config.max_hypothesis_count)
     return distinct(

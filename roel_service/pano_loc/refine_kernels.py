@@ -92,11 +92,11 @@ def match_rays(
         nx, ny, nz = normals[a]
         for j in range(len(directions)):
             # In scalars, and the test that most lines fail first.
-            off = nx * directions[j, 0] + ny * directions[j, 1] + nz * directions[j, 2]
-            if abs(off) > sine or not sound[j]:
-                continue
             mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
-            if abs(nx * mx + ny * my + nz * mz) < cosine:
+            if abs(nx * mx + ny * my + nz * mz) < cosine or not sound[j]:
+                continue
+            off = nx * directions[j, 0] + ny * directions[j, 1] + nz * directions[j, 2]
+            if abs(off) > sine:
                 continue
             fx, fy, fz = from_start[j, 0], from_start[j, 1], from_start[j, 2]
             tx, ty, tz = to_end[j, 0], to_end[j, 1], to_end[j, 2]
