@@ -65,12 +65,9 @@ def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
     scan has some too.
 
     Raises:
-        CloudError: fewer points than `MIN_POINT_COUNT`, or one that is not finite.
+        CloudError: fewer points than `MIN_POINT_COUNT`.
     """
-    if len(cloud) < MIN_POINT_COUNT:
-        raise CloudError("cloud", f"at least {MIN_POINT_COUNT} points", f"{len(cloud)}")
-    if not np.isfinite(cloud.points).all():
-        raise CloudError("cloud", "finite points", "NaN or infinity")
+    require_points(cloud)
     points = thin(cloud.points.astype(np.float64), config.voxel_m)
     tree = cKDTree(points)
     resolution_m = max(config.voxel_m, _spacing(points, tree))
@@ -100,6 +97,12 @@ def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
             VOTING_CELLS * resolution_m,
         ),
     )
+
+
+def require_points(cloud: PointCloud) -> None:
+    """Raise `CloudError` for a cloud of fewer points than `MIN_POINT_COUNT`."""
+    if len(cloud) < MIN_POINT_COUNT:
+        raise CloudError("cloud", f"at least {MIN_POINT_COUNT} points", f"{len(cloud)}")
 
 
 def prepare_map(line_map: LineMap, config: RegisterConfig) -> PreparedCloud:

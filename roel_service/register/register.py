@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import CloudError
 from roel_service.geometry.se3 import SE3
@@ -15,7 +15,7 @@ from roel_service.register.align import Level, align
 from roel_service.register.alignment import Alignment
 from roel_service.register.guesses import Guess, guesses_anywhere, guesses_near
 from roel_service.register.point_to_point import align_points
-from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map
+from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map, require_points
 from roel_service.register.source import Source, require_lines, source_of_cloud, source_of_map
 from roel_service.register.verdict import Rival, agreement, judge
 from roel_service.scene.clouds import PointCloud
@@ -60,12 +60,11 @@ def register_map(
 
     Raises:
         NoAnswerError: fewer than three lines.
-        CloudError: a cloud in another unit than the map, of too few points, or with points that are
-            not finite.
+        CloudError: a cloud in another unit than the map, or of too few points.
     """
     moving = source_of_map(source) if isinstance(source, LineMap) else source_of_cloud(source)
     if not isinstance(target, PreparedCloud):
-        points = target.points if isinstance(target, PointCloud) else _ends(target)
+        points = _points(target) if isinstance(target, PointCloud) else _ends(target)
         if not config.estimate_scale:
             require_same_unit(moving, points)
         target = _prepared(target, config)
@@ -83,6 +82,12 @@ def register_map(
     else:
         guesses = guesses_near(moving, target, T_init, config)
     return _best(guesses, moving, target, config)
+
+
+def _points(cloud: PointCloud) -> Array:
+    """(N, 3) enough points to be a place."""
+    require_points(cloud)
+    return cloud.points
 
 
 def _ends(line_map: LineMap) -> FloatArray:
@@ -178,7 +183,7 @@ def _by_points(
     )
 
 
-def require_same_unit(source: Source, points: FloatArray) -> None:
+def require_same_unit(source: Source, points: Array) -> None:
     """Refuse a cloud that is so much larger or smaller that its unit must be another one."""
     source_m, target_m = (float(np.ptp(p, axis=0).max()) for p in (source.samples.points, points))
     ratio = target_m / max(source_m, 1e-9)
