@@ -116,7 +116,6 @@ def test_errors_drawn_from_the_covariance_are_honest():
     assert normalised_errors(result, given, given).mean() == pytest.approx(1.0, abs=0.2)
 
 
-@pytest.mark.skipif(not poses_report.RESULTS.exists(), reason="no committed rows")
 def test_the_page_is_that_of_the_committed_rows():
     page = poses_report.document(read_results(poses_report.RESULTS))
     assert poses_report.DOCUMENT.read_text(encoding="utf-8") == page
