@@ -12,9 +12,6 @@ from roel_client import Client
 from roel_service.errors import NotFoundError, RoelError
 from roel_service.v1 import events_pb2, maps_pb2, types_pb2
 
-# The newest ones are read back after each kill; the check of the folder reads all.
-READ_BLOB_COUNT = 5
-
 
 @dataclass
 class Ledger:
@@ -68,18 +65,23 @@ class Ledger:
             if self.ends.setdefault(operation, end) != end:
                 self.broken.append(f"{operation} ended as {self.ends[operation]} and as {end}")
 
-    def check(self, client: Client) -> None:
-        """Ask a server for everything; what it does not know any more is a broken promise."""
+    def check(self, client: Client, newest_count: int | None = None) -> None:
+        """Ask a server for everything; what it does not know any more is a broken promise.
+
+        Args:
+            newest_count: look only at so many of each kind; None looks at all.
+        """
+        newest = slice(-newest_count if newest_count else None, None)
         with self._lock:
-            events, digests, maps = dict(self.events), dict(self.digests), dict(self.maps)
-            blobs = list(self.blobs.items())[-READ_BLOB_COUNT:]
-        for name, event_count in events.items():
+            events, digests = list(self.events.items())[newest], list(self.digests.items())[newest]
+            maps, blobs = list(self.maps.items())[newest], list(self.blobs.items())[newest]
+        for name, event_count in events:
             is_kept = event_count <= self._found(client, name).event_count
             self._expect(name, is_kept or name not in self.events, "lost events")
-        for name, digest in digests.items():
+        for name, digest in digests:
             is_kept = digest == self._found(client, name).digest
             self._expect(name, is_kept or name not in self.digests, "another digest")
-        for name, sha256 in maps.items():
+        for name, sha256 in maps:
             found = hashlib.sha256(client.download_map(name)).hexdigest()
             self._expect(name, found == sha256, "another map")
         with tempfile.TemporaryDirectory() as folder:

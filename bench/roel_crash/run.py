@@ -29,6 +29,9 @@ RETRY_COUNT = 8
 LONGEST_LIFE_S = 2.5
 
 CHECKER_COUNT = 2
+# Of each kind are asked for after a kill, and everything at the end: asking for all each time would
+# take longer than all the rest.
+NEWEST_COUNT = 10
 
 # What is counted of a kill for which there was no occasion.
 NOT_MET = " (not met)"
@@ -144,9 +147,11 @@ def crash(
             victim = _restarted(folder, port, log, outcome, following)
         if not following:
             with Client(f"127.0.0.1:{port}", retry=PATIENT, timeout_s=60.0) as client:
-                ledger.check(client)
+                ledger.check(client, NEWEST_COUNT)
     for checker in checkers:
         checker.end()
+    with Client(f"127.0.0.1:{port}", retry=PATIENT, timeout_s=60.0) as client:
+        ledger.check(client)
     if victim.stop() != 0:
         outcome.broken.append("the last server did not drain")
     outcome.broken += ledger.broken + check_folder(folder).problems + _unended(folder, ledger)
