@@ -401,6 +401,7 @@ class Client:
         image: bytes | types_pb2.BlobRef,
         *,
         T_prior: SE3 | None = None,
+        camera: Camera | None = None,
         max_hypothesis_count: int = 0,
         config: LocalizeConfig | None = None,
         timeout_s: float = ANSWER_TIMEOUT_S,
@@ -411,11 +412,16 @@ class Client:
             map_versions: names of the versions that may hold the place.
             image: JPEG or PNG, or an uploaded one.
             T_prior: first T_world_panorama.
+            camera: that of an ordinary photograph, which needs a prior; None for a panorama.
             max_hypothesis_count: most answers; 0 takes what the parameters say.
             config: parameters; those of the server by default.
         """
         request = localize_request(
-            map_versions, T_prior=T_prior, max_hypothesis_count=max_hypothesis_count, config=config
+            map_versions,
+            T_prior=T_prior,
+            camera=camera,
+            max_hypothesis_count=max_hypothesis_count,
+            config=config,
         )
         if isinstance(image, bytes):
             request.image = image

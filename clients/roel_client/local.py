@@ -618,6 +618,7 @@ async def _locating_here(
             maps=maps,
             image=await asyncio.to_thread(_picture_bytes, query),
             prior=prior,
+            camera=None,
             gravity=None,
             max_hypothesis_count=config.max_hypothesis_count,
             config=config,

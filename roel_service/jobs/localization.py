@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
-from roel_service.io.images import decode_panorama
+from roel_service.arrays import Array
+from roel_service.io.images import decode_panorama, decode_photograph
 from roel_service.jobs.preparations import Form, Origin, Preparations
 from roel_service.jobs.questions import LocalizeQuestion, MapFile, StoredFile
-from roel_service.pano_loc.localize import localize_panorama
+from roel_service.pano_loc.localize import localize_panorama, localize_photograph
 from roel_service.pano_loc.prepare import PreparedMap, prepare_map
+from roel_service.scene.results import PanoLocResult
 from roel_service.v1 import localization_pb2
 from roel_service.wire.localization import localization_to_proto
 
@@ -27,13 +30,11 @@ def answer(
         CorruptionError: a file that is not what its digest says.
     """
     start_s = time.perf_counter()
-    grey = decode_panorama(_bytes(question.image), SUBJECT)
+    grey = _decoded(question)
     decoded_s = time.perf_counter()
     maps = [_prepared(file, question, preparations) for file in question.maps]
     prepared_s = time.perf_counter()
-    result = localize_panorama(
-        grey, maps, question.config, prior=question.prior, gravity=question.gravity
-    )
+    result = _located(grey, maps, question)
     end_s = time.perf_counter()
     names = [file.name for file in question.maps]
     message = localization_to_proto(result, names, question.max_hypothesis_count)
@@ -41,6 +42,21 @@ def answer(
     message.stage_seconds["prepare"] = prepared_s - decoded_s
     message.stage_seconds["localize"] = message.seconds = end_s - prepared_s
     return message
+
+
+def _decoded(question: LocalizeQuestion) -> Array:
+    """(H, W) uint8 grey values."""
+    data = _bytes(question.image)
+    if question.camera is None:
+        return decode_panorama(data, SUBJECT)
+    return decode_photograph(data, question.camera, SUBJECT)
+
+
+def _located(grey: Array, maps: Sequence[PreparedMap], question: LocalizeQuestion) -> PanoLocResult:
+    config, prior, gravity = question.config, question.prior, question.gravity
+    if question.camera is None or prior is None:
+        return localize_panorama(grey, maps, config, prior=prior, gravity=gravity)
+    return localize_photograph(grey, question.camera, maps, config, prior=prior, gravity=gravity)
 
 
 def _bytes(image: StoredFile | bytes) -> bytes:

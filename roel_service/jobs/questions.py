@@ -19,13 +19,14 @@ from roel_service.errors import ConfigError, CorruptionError, InputError, LimitE
 from roel_service.geometry.se3 import SE3
 from roel_service.jobs.inputs import CachePlace
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
+from roel_service.scene.camera import Camera
 from roel_service.scene.lines import LineMap
 from roel_service.store.maps import Maps
 from roel_service.store.store import maps_of
 from roel_service.v1 import config_pb2, localization_pb2, registration_pb2, types_pb2
 from roel_service.wire import names
 from roel_service.wire.configs import config_from_proto
-from roel_service.wire.nouns import transform_from_proto, vector_from_proto
+from roel_service.wire.nouns import camera_from_proto, transform_from_proto, vector_from_proto
 from roel_service.wire.registration import METHODS
 from roel_service.wire.rlm import decode_map
 
@@ -95,6 +96,7 @@ class LocalizeQuestion:
 
     Attributes:
         image: an encoded picture, uploaded or as it came.
+        camera: that of an ordinary photograph, which has a prior; None: a panorama.
         max_hypothesis_count: of those in the answer.
         cache: where prepared maps are kept.
     """
@@ -102,6 +104,7 @@ class LocalizeQuestion:
     maps: tuple[MapFile, ...]
     image: StoredFile | bytes
     prior: PosePrior | None
+    camera: Camera | None
     gravity: Gravity | None
     max_hypothesis_count: int
     config: LocalizeConfig
@@ -159,8 +162,6 @@ class Questions:
 
     def search(self, request: localization_pb2.LocalizeRequest) -> LocalizeQuestion:
         """Where and how to look, for any picture; raises as `registration`."""
-        if request.HasField("camera"):
-            raise InputError("camera", "none: pictures are panoramas", "one")
         if request.preset not in ("", DEFAULT_PRESET):
             # The others are other methods, anchors of the benchmark.
             raise ConfigError("preset", DEFAULT_PRESET, request.preset)
@@ -170,6 +171,7 @@ class Questions:
             maps=self._map_files(request.map_versions),
             image=b"",
             prior=pose_prior(request.prior) if request.HasField("prior") else None,
+            camera=_camera(request),
             gravity=_gravity(request),
             max_hypothesis_count=_hypothesis_count(request, config),
             config=config,
@@ -260,6 +262,14 @@ def _register_config(request: registration_pb2.RegisterRequest) -> RegisterConfi
 def pose_prior(message: types_pb2.Transform) -> PosePrior:
     """About where a picture was taken; raises `InputError`."""
     return PosePrior(T_world_picture=transform_from_proto(message, "prior"))
+
+
+def _camera(request: localization_pb2.LocalizeRequest) -> Camera | None:
+    if not request.HasField("camera"):
+        return None
+    if not request.HasField("prior"):
+        raise InputError("prior", "a first pose, as there is a camera", "none")
+    return camera_from_proto(request.camera)
 
 
 def _gravity(request: localization_pb2.LocalizeRequest) -> Gravity | None:

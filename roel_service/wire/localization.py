@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
+from roel_service.scene.camera import Camera
 from roel_service.scene.results import (
     LocalizationStatus,
     NoPoseReason,
@@ -16,6 +17,7 @@ from roel_service.scene.results import (
 from roel_service.v1 import localization_pb2, types_pb2
 from roel_service.wire.configs import tables_to_proto
 from roel_service.wire.nouns import (
+    camera_to_proto,
     matrix6_from_proto,
     matrix6_to_proto,
     transform_from_proto,
@@ -35,6 +37,7 @@ def localize_request(
     map_versions: Sequence[str],
     *,
     T_prior: SE3 | None = None,
+    camera: Camera | None = None,
     max_hypothesis_count: int = 0,
     config: LocalizeConfig | None = None,
 ) -> localization_pb2.LocalizeRequest:
@@ -44,6 +47,8 @@ def localize_request(
     )
     if T_prior is not None:
         request.prior.CopyFrom(prior_to_proto(T_prior))
+    if camera is not None:
+        request.camera.CopyFrom(camera_to_proto(camera))
     if config is not None:
         tables = {"localize": dataclasses.asdict(config)}
         request.config.CopyFrom(tables_to_proto(tables).localize)

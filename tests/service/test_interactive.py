@@ -31,7 +31,8 @@ from roel_service.io.clouds import write_npz
 from roel_service.io.images import decode_panorama
 from roel_service.jobs.batch_inputs import BatchParameters
 from roel_service.jobs.batches import run_batch_localize, run_batch_register
-from roel_service.pano_loc.localize import localize_panorama
+from roel_service.pano_loc.hints import PosePrior
+from roel_service.pano_loc.localize import localize_panorama, localize_photograph
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.progress import ignore
 from roel_service.register.register import register_map
@@ -56,7 +57,9 @@ from roel_service.wire.registration import register_request, registration_from_p
 from roel_service.wire.rlm import decode_map, encode_map
 
 from ..pano_loc.rooms import OTHER_FURNITURE, OTHER_ROOM, map_of, pose, segments_of
-from ..pano_loc.wireframe import wireframe_panorama
+from ..pano_loc.test_photograph import CAMERA, FIRST
+from ..pano_loc.test_photograph import TRUTH as PHOTOGRAPH
+from ..pano_loc.wireframe import wireframe_panorama, wireframe_photograph
 from ..register.rooms import room_cloud, room_map
 from .processes import Server
 
@@ -221,6 +224,20 @@ class TestLocalize:
         assert answer.stage_seconds["prepare"] < 0.05
         assert len(answer.hypotheses) == 1
 
+    def test_a_photograph_has_a_camera_and_a_prior(self, client, places):
+        drawn = wireframe_photograph(PHOTOGRAPH, segments_of(), CAMERA)
+        image = cv2.imencode(".png", drawn)[1].tobytes()
+        answer = client.localize(places[:1], image, camera=CAMERA, T_prior=FIRST)
+        stored = decode_map(encode_map(MAPS["here"], Provenance())).line_map
+        maps = [prepare_map(stored, LocalizeConfig())]
+        prior = PosePrior(T_world_picture=FIRST)
+        here = localize_photograph(drawn, CAMERA, maps, LocalizeConfig(), prior=prior)
+        there = localization_from_proto(answer)
+        assert here.status is there.status is LocalizationStatus.FOUND
+        np.testing.assert_array_equal(
+            there.T_world_panorama.matrix(), here.T_world_panorama.matrix()
+        )
+
     def test_a_picture_of_another_place_is_not_found_there(self, client, places, picture):
         answer = client.localize(places[1:], picture, config=FAST)
         assert answer.status == localization_pb2.LocalizeResponse.STATUS_NOT_FOUND
@@ -241,7 +258,7 @@ class TestLocalize:
             ),
             ({"up_sigma_deg": 100.0, "up_world": UP, "up_panorama": UP}, InputError, "0 to 90"),
             ({"preset": "paper"}, ConfigError, "preset: expected default, found paper"),
-            ({"camera": types_pb2.Camera()}, InputError, "camera: expected none"),
+            ({"camera": types_pb2.Camera()}, InputError, "prior: expected a first pose, as there"),
             ({"prior": types_pb2.Transform()}, InputError, "prior: expected 9 numbers"),
             ({"image": b"GIF89a"}, PanoramaError, "image: expected a JPEG or PNG picture"),
             ({"image_blob": types_pb2.BlobRef(sha256="0" * 64)}, NotFoundError, "blob"),
