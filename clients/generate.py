@@ -27,6 +27,7 @@ WORDS = {
     "AsyncConnection": "Connection",
     "AsyncExchange": "Exchange",
     "AsyncPictureStream": "PictureStream",
+    "AsyncTracking": "Tracking",
     "AsyncIterator": "Iterator",
     "AsyncGenerator": "Generator",
     "__aenter__": "__enter__",

@@ -1,8 +1,8 @@
 """A camera followed through rooms that were mapped on another walk: `python -m roel_bench.tracking`.
 
 `follow` begins 20 cm and 10 degrees off and follows the whole walk; `start` does so for a moment, from
-many places of the walk; `jump` leaves out a second of the events, as if the camera had been carried
-blindfold; `elsewhere` follows the walk in the map of another room. A pose that is told as TRACKING is
+many places of the walk; `jump` leaves out a third of a second of the events, then a second, as if the camera
+had been carried blindfold; `elsewhere` follows the walk in the map of another room. A pose that is told as TRACKING is
 wrong when it is more than 5 cm or 2 degrees off.
 """
 
@@ -38,8 +38,9 @@ FORMAT = "roel tracking benchmark 1"
 WRONG_M, WRONG_DEG = 0.05, 2.0
 # A pose that is this near was found.
 FOUND_M, FOUND_DEG = 0.02, 1.0
-START_COUNT, START_US = 10, 200_000
-JUMP_US = 1_000_000
+START_COUNT, START_US = 10, 600_000
+JUMP_BEGIN_US, JUMP_US = 1_000_000, (300_000, 1_000_000)
+ELSEWHERE_US = 2_000_000
 # Events come in pieces of so many.
 PIECE_EVENT_COUNT = 30_000
 
@@ -168,7 +169,11 @@ def trial(
         began_s = time.process_time()
         poses = tracker.push(events)
         busy_s += time.process_time() - began_s
-        told += [(pose, pose.t_us + behind_us) for pose in poses]
+        # A pose belongs to before the cut even if the events that complete it come after.
+        told += [
+            (pose, pose.t_us + (behind_us if cut_us and pose.t_us > cut_us[0] else 0))
+            for pose in poses
+        ]
     errors, nees = _errors(walk.trajectory, told)
     is_wrong = (errors[:, 0] > WRONG_DEG) | (errors[:, 1] > 1e3 * WRONG_M)
     is_near = (errors[:, 0] < FOUND_DEG) & (errors[:, 1] < 1e3 * FOUND_M)
@@ -230,10 +235,12 @@ def trials(walk: Walk, elsewhere: Sequence[tuple[str, LineMap]], kinds: set[str]
         for seed, begin in enumerate(np.linspace(first_us, last_us - START_US, START_COUNT)):
             rows.append(trial(walk, *own, "start", seed, (int(begin), int(begin) + START_US)))
     if "jump" in kinds:
-        cut_us = (first_us + JUMP_US, first_us + 2 * JUMP_US)
-        rows.append(trial(walk, *own, "jump", 0, (first_us, last_us), cut_us))
+        begin_us = first_us + JUMP_BEGIN_US
+        for seed, jump_us in enumerate(JUMP_US):
+            cut_us = (begin_us, begin_us + jump_us)
+            rows.append(trial(walk, *own, "jump", seed, (first_us, last_us), cut_us))
     if "elsewhere" in kinds:
-        span_us = (first_us, first_us + 2 * JUMP_US)
+        span_us = (first_us, first_us + ELSEWHERE_US)
         for seed, (name, line_map) in enumerate(elsewhere):
             rows.append(trial(walk, line_map, name, "elsewhere", seed, span_us))
     return rows

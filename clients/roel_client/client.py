@@ -28,13 +28,14 @@ from roel_client.uploads import (
     map_format,
 )
 from roel_service.arrays import Array, FloatArray
-from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig
+from roel_service.config.stages import Config, LocalizeConfig, RegisterConfig, TrackConfig
 from roel_service.errors import CorruptionError, RoelError
 from roel_service.geometry.se3 import SE3
 from roel_service.progress import ProgressCallback, ignore
 from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventSlice, EventSource
+from roel_service.scene.events import EventSlice, EventSource, EventStream
 from roel_service.scene.lines import LineMap
+from roel_service.scene.results import TrackedPose
 from roel_service.scene.trajectory import Trajectory
 from roel_service.v1 import (
     blobs_pb2,
@@ -54,6 +55,7 @@ from roel_service.v1 import (
 from roel_service.v1 import operations_pb2 as roel_operations_pb2
 from roel_service.v1 import operations_pb2_grpc as roel_operations_pb2_grpc
 from roel_service.wire import names
+from roel_service.wire.chunks import encode_chunk, split_chunks
 from roel_service.wire.configs import config_to_proto
 from roel_service.wire.delimited import delimited, messages
 from roel_service.wire.errors import error_from_status
@@ -66,6 +68,7 @@ from roel_service.wire.nouns import (
 )
 from roel_service.wire.registration import register_request
 from roel_service.wire.results import Report, progress_from_proto, report_from_proto
+from roel_service.wire.tracking import guess_to_proto, tracked_pose_from_proto, tracking_setup
 
 Result = TypeVar("Result")
 
@@ -488,6 +491,30 @@ class Client:
             path.write_bytes(b"".join(map(delimited, requests)))
             return self.upload_blob(path)
 
+    @contextlib.contextmanager
+    def tracking(
+        self,
+        map_version: str,
+        camera: Camera,
+        T_world_camera: SE3,
+        *,
+        t_us: int = 0,
+        config: TrackConfig | None = None,
+    ) -> Iterator[Tracking]:
+        """A camera that is followed in a map, events up and poses down.
+
+        Args:
+            map_version: name of the version that holds the place.
+            camera: calibration of the sensor.
+            T_world_camera: about where it is, within `config.reach_m` and `reach_deg`.
+            t_us: when it is there; earlier events are passed over.
+            config: parameters; those of the server by default.
+        """
+        setup = tracking_setup(map_version, camera, T_world_camera, t_us, config)
+        with self._connection.exchange(self._localization.TrackPoses) as exchange:
+            exchange.send(localization_pb2.TrackPosesRequest(setup=setup))
+            yield Tracking(exchange)
+
     def operation(self, name: str) -> Operation:
         """An operation that was begun before, perhaps by somebody else."""
         return Operation(self._connection, name)
@@ -693,6 +720,38 @@ class PictureStream:
     def receive(self) -> localization_pb2.StreamLocalizeResponse | None:
         """The next answer, or why there is none; None after the last."""
         return self._exchange.receive()
+
+
+class Tracking:
+    """Events of a camera on their way; sending and receiving may be two tasks.
+
+    A server reads no further than it has got with its work: `send` waits then.
+    """
+
+    def __init__(self, exchange: Exchange) -> None:
+        self._exchange = exchange
+        self._seq = 0
+
+    def send(self, events: EventStream) -> None:
+        """The next events."""
+        for part in split_chunks(events):
+            chunk = events_pb2.EventChunk(seq=self._seq, data=encode_chunk(part))
+            self._exchange.send(localization_pb2.TrackPosesRequest(chunk=chunk))
+            self._seq += 1
+
+    def guess(self, T_world_camera: SE3) -> None:
+        """About where the camera is now, for one that is lost."""
+        guess = guess_to_proto(T_world_camera)
+        self._exchange.send(localization_pb2.TrackPosesRequest(guess=guess))
+
+    def finish(self) -> None:
+        """Say that no events follow."""
+        self._exchange.finish()
+
+    def receive(self) -> TrackedPose | None:
+        """The next pose; None after the last."""
+        answer = self._exchange.receive()
+        return None if answer is None else tracked_pose_from_proto(answer)
 
 
 class Operation:

@@ -510,7 +510,7 @@ class TrackConfig(Stage, table="track"):
     line_noise_px: float = parameter(0.3, POSITIVE)
     line_noise_m: float = parameter(0.004, POSITIVE)
     min_seen_share: float = parameter(0.6, SHARE)
-    min_sharpness: float = parameter(6.0, POSITIVE)
+    min_sharpness: float = parameter(20.0, POSITIVE)
     max_sigma_m: float = parameter(0.03, POSITIVE)
     max_sigma_deg: float = parameter(1.0, POSITIVE)
 

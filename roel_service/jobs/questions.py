@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from roel_service.arrays import FloatArray
-from roel_service.config.stages import LocalizeConfig, RegisterConfig
+from roel_service.config.stages import LocalizeConfig, RegisterConfig, TrackConfig
 from roel_service.errors import ConfigError, CorruptionError, InputError, LimitError
 from roel_service.geometry.se3 import SE3
 from roel_service.jobs.inputs import CachePlace
@@ -111,6 +111,36 @@ class LocalizeQuestion:
     cache: CachePlace | None
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrackingBegins:
+    """Where a camera begins to be tracked.
+
+    Attributes:
+        T_world_camera: about where it is at `t_us`; earlier events are passed over.
+    """
+
+    map: MapFile
+    camera: Camera
+    T_world_camera: SE3
+    t_us: int
+    config: TrackConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class NextChunk:
+    """Encoded events."""
+
+    seq: int
+    data: bytes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class NextGuess:
+    """About where the camera is now."""
+
+    T_world_camera: SE3
+
+
 Question = RegisterQuestion | LocalizeQuestion
 
 
@@ -176,6 +206,17 @@ class Questions:
             max_hypothesis_count=_hypothesis_count(request, config),
             config=config,
             cache=self._cache,
+        )
+
+    def tracking(self, setup: localization_pb2.TrackingSetup) -> TrackingBegins:
+        """The first message of TrackPoses; raises as `registration`."""
+        tables = config_pb2.MappingConfig(track=setup.config)
+        return TrackingBegins(
+            map=self._map_file(setup.map_version),
+            camera=camera_from_proto(setup.camera),
+            T_world_camera=transform_from_proto(setup.T_world_camera, "T_world_camera"),
+            t_us=setup.t_us,
+            config=config_from_proto(tables, setup.preset or DEFAULT_PRESET).track,
         )
 
     def _map_files(self, map_versions: Sequence[str]) -> tuple[MapFile, ...]:

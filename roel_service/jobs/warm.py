@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import Any
 
 from roel_service.errors import LimitError
@@ -38,15 +40,28 @@ class WarmExecutor:
 
     async def run(self, spec: TaskSpec, on_news: OnNews) -> Any:
         """As every executor, and raises `LimitError` QUEUE_FULL."""
+        async with self.held(spec.limits.memory_bytes) as child:
+            return await child.run(spec, on_news)
+
+    @asynccontextmanager
+    async def held(self, memory_bytes: int) -> AsyncIterator[Child]:
+        """A child for several calls, one after the other, which it may remember.
+
+        Args:
+            memory_bytes: a child that holds more at the end is replaced.
+
+        Raises:
+            LimitError: QUEUE_FULL.
+        """
         if self._admitted_count == self._max_admitted_count:
             raise LimitError("call", "room in the queue", "a full one", reason="QUEUE_FULL")
         self._admitted_count += 1
         try:
             child = await self._ready_child()
             try:
-                return await child.run(spec, on_news)
+                yield child
             finally:
-                await asyncio.shield(self._give_back(child, spec))
+                await asyncio.shield(self._give_back(child, memory_bytes))
         finally:
             self._admitted_count -= 1
 
@@ -63,8 +78,8 @@ class WarmExecutor:
         # It may have been killed while it waited.
         return child if child.is_reusable else _WarmChild(self._preload)
 
-    async def _give_back(self, child: _WarmChild, spec: TaskSpec) -> None:
-        if child.is_fit(spec.limits.memory_bytes):
+    async def _give_back(self, child: _WarmChild, memory_bytes: int) -> None:
+        if child.is_fit(memory_bytes):
             self._idle.put_nowait(child)
             return
         self._idle.put_nowait(_WarmChild(self._preload))

@@ -13,8 +13,9 @@ from roel_service.errors import InputError, LimitError, RoelError
 from roel_service.jobs.questions import LocalizeQuestion, Questions, pose_prior
 from roel_service.service.asking import Asking
 from roel_service.service.batches import Batching
+from roel_service.service.following import Following
 from roel_service.service.settings import Settings
-from roel_service.service.uploads import request_part
+from roel_service.service.uploads import next_request, request_part
 from roel_service.v1 import localization_pb2
 from roel_service.wire.errors import status_from_error
 
@@ -23,11 +24,17 @@ class LocalizationServicer:
     """Makes questions of requests, and has them answered."""
 
     def __init__(
-        self, questions: Questions, asking: Asking, batching: Batching, settings: Settings
+        self,
+        questions: Questions,
+        asking: Asking,
+        batching: Batching,
+        following: Following,
+        settings: Settings,
     ) -> None:
         self._questions = questions
         self._asking = asking
         self._batching = batching
+        self._following = following
         self._settings = settings
 
     async def Localize(
@@ -54,6 +61,17 @@ class LocalizationServicer:
         self, request: localization_pb2.BatchLocalizeRequest, context: Any
     ) -> operations_pb2.Operation:
         return await self._batching.begin(request)
+
+    async def TrackPoses(
+        self, requests: AsyncIterator[localization_pb2.TrackPosesRequest], context: Any
+    ) -> AsyncIterator[localization_pb2.TrackPosesResponse]:
+        request = await next_request(requests, self._settings)
+        if request is None:
+            raise InputError("stream", "a message that says where the camera is", "none")
+        setup = request_part(request, "setup")
+        begins = await asyncio.to_thread(self._questions.tracking, setup)
+        async for pose in self._following.poses(begins, requests):
+            yield pose
 
     async def _setup(
         self, requests: AsyncIterator[localization_pb2.StreamLocalizeRequest]

@@ -32,6 +32,7 @@ from roel_service.service.admin import Probes, admin_server
 from roel_service.service.asking import PRELOAD, Asking
 from roel_service.service.calls import Guard, GuardInterceptor
 from roel_service.service.exports import Exporter
+from roel_service.service.following import TRACKING_ENTRYPOINT, Following
 from roel_service.service.guards import CallLimits, Drain, FullMethods, told_errors
 from roel_service.service.listen import Listen
 from roel_service.service.observe import Auditing, Metrics, Observation
@@ -122,8 +123,12 @@ async def running(
         questions = WarmExecutor(
             settings.interactive_workers, settings.interactive_queued, preload=PRELOAD
         )
+        cameras = WarmExecutor(
+            settings.tracked_cameras, settings.tracked_cameras, preload=TRACKING_ENTRYPOINT
+        )
         exporter, asking = Exporter(store, exports, settings), Asking(questions, settings)
-        add_services(server, store, scheduler, exporter, asking, settings)
+        following = Following(cameras, settings)
+        add_services(server, store, scheduler, exporter, asking, following, settings)
         health_servicer = await _add_health(server)
         address = listen.bind(server, credentials)
         admin = None
@@ -143,6 +148,7 @@ async def running(
             await server.stop(STOP_GRACE_S)
             await exports.close()
             await questions.close()
+            await cameras.close()
 
 
 def _scheduler(store: Store, settings: Settings, metrics: Metrics) -> Scheduler:

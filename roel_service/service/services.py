@@ -15,6 +15,7 @@ from roel_service.service.blobs import BlobServicer
 from roel_service.service.capabilities import CapabilitiesServicer
 from roel_service.service.event_streams import EventStreamServicer
 from roel_service.service.exports import Exporter
+from roel_service.service.following import Following
 from roel_service.service.localization import LocalizationServicer
 from roel_service.service.maps import MapServicer
 from roel_service.service.methods import complete
@@ -82,6 +83,7 @@ def add_services(
     scheduler: Scheduler,
     exporter: Exporter,
     asking: Asking,
+    following: Following,
     settings: Settings,
 ) -> None:
     """Add every service of the protocol; methods that nobody wrote yet refuse."""
@@ -114,7 +116,9 @@ def add_services(
         "BlobService": BlobServicer(store.uploads, uploads, settings),
         "MapService": MapServicer(store, scheduler, exporter, settings),
         "RegistrationService": RegistrationServicer(questions, asking, registrations),
-        "LocalizationService": LocalizationServicer(questions, asking, localizations, settings),
+        "LocalizationService": LocalizationServicer(
+            questions, asking, localizations, following, settings
+        ),
         "OperationService": operations,
         "Operations": operations,
     }

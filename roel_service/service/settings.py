@@ -51,6 +51,7 @@ class Settings:
         interactive_workers: children that answer callers who wait; all methods share them.
         interactive_queued: such questions that may wait for a child.
         interactive_time_s: how long an answer may take.
+        tracked_cameras: cameras that are followed at a time; each holds a child for itself.
         open_streams: streams of pictures or events that are located at a time.
         stream_credit_pictures: pictures of a stream that may be unanswered.
         batch_item_count: most requests of a batch.
@@ -98,6 +99,7 @@ class Settings:
     batch_item_count: int = 100_000
     batch_item_time_s: float = 10.0
     inline_point_count: int = 250_000
+    tracked_cameras: int = 2
     open_streams: int = 32
     stream_credit_pictures: int = 4
     export_time_s: float = 300.0

@@ -29,8 +29,8 @@ from roel_service.tracking.fit import MIN_DEPTH_SHARE, View, Window, WindowFit, 
 from roel_service.tracking.motion import MotionState
 from roel_service.tracking.pieces import MapPieces, equal_parts
 
-# Lines of one moment: one window without poses, so of few events.
-FRAMES = FramesConfig(compensate_rotation=False)
+# Lines of one moment: without poses nothing undoes motion, so one window, and a short one.
+FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
 DETECT = DetectConfig(window_events_per_pixel=(0.1,))
 # Directions that are told apart, of half a turn.
 DIRECTION_COUNT = 12

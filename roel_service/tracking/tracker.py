@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from roel_service.config.stages import TrackConfig
@@ -17,14 +19,16 @@ from roel_service.tracking.fit import View, Window, WindowFit, fit_window, windo
 from roel_service.tracking.locate import EVENT_SCALES_PX, Eyes, locate
 from roel_service.tracking.motion import MotionState
 from roel_service.tracking.pieces import pieces_of
-from roel_service.tracking.verdict import Verdict, agrees
+from roel_service.tracking.verdict import Verdict, is_possible
 
 # To be found, a pose needs events this far around it; to be followed, those of its interval do.
 FINDING_HALF_US = 25_000
-# A lost pose is looked for every so many intervals.
-FINDING_STRIDE = 10
+# A lost pose is looked for in so many intervals at once, and in every so many after that.
+FINDING_AT_ONCE, FINDING_STRIDE = 4, 7
+# A camera that is out of sight goes on for so long, at the most.
+MAX_COAST_S = 1.0
 # Each time it is looked for around another place; these wander off as a hand-held camera does.
-WANDER_M_S, WANDER_DEG_S = 0.3, 20.0
+WANDER_M_S, WANDER_DEG_S = 0.2, 15.0
 MAX_WANDER_S = 3.0
 # Without events for so long, the camera may be anywhere within reach.
 MAX_SILENCE_US = 500_000
@@ -65,9 +69,13 @@ class PoseTracker:
 
     def guess(self, T_world_camera: SE3) -> None:
         """Give up what is known, and look around another pose."""
-        self._state = None
-        self._last = T_world_camera
-        self._lost_count = 0
+        self._last = MotionState(
+            t_us=self._next_us,
+            T_world_camera=T_world_camera,
+            velocity=np.zeros(6),
+            covariance=np.zeros((12, 12)),
+        )
+        self._lose()
 
     def push(self, events: EventStream) -> list[TrackedPose]:
         """The poses of the intervals that these events complete.
@@ -78,8 +86,14 @@ class PoseTracker:
         Raises:
             EventsError: events that are older than the last ones, or of another sensor.
         """
-        if len(events) == 0:
-            return []
+        silences = np.flatnonzero(np.diff(events.t_us) > MAX_SILENCE_US) + 1
+        poses = []
+        for first, last in pairwise([0, *silences.tolist(), len(events)]):
+            if first < last:
+                poses += self._advanced(events.part(first, last))
+        return poses
+
+    def _advanced(self, events: EventStream) -> list[TrackedPose]:
         buffer = self._buffer = self._extended(events)
         poses = []
         while buffer.t_us[-1] >= self._next_us + self._reach_us():
@@ -91,7 +105,8 @@ class PoseTracker:
         camera = self._eyes.camera
         if (events.width, events.height) != (camera.width, camera.height):
             expected = f"a sensor of {camera.width}x{camera.height} as in the calibration"
-            raise EventsError("events", expected, f"{events.width}x{events.height}")
+            found = f"{events.width}x{events.height}"
+            raise EventsError("events", expected, found, reason="SENSOR_MISMATCH")
         first_us = int(events.t_us[0])
         if self._buffer is None:
             self._next_us = first_us + self._reach_us()
@@ -130,15 +145,17 @@ class PoseTracker:
             return _lost(window, fit)
         self._state = fit.state
         if status is PoseStatus.TRACKING:
-            self._last = fit.state.T_world_camera
+            self._last = fit.state
         return _told(window, status, fit)
 
     def _found(self, window: Window, buffer: EventStream) -> TrackedPose:
         self._lost_count += 1
-        if (self._lost_count - 1) % FINDING_STRIDE:
+        if self._lost_count > FINDING_AT_ONCE and self._lost_count % FINDING_STRIDE:
             return _lost(window, None)
-        fit = locate(self._wandered(), buffer, window, self._eyes, self._config, self._rng)
-        if fit is None or not agrees(fit, self._config):
+        fit = locate(
+            self._place_to_look(window.t_us), buffer, window, self._eyes, self._config, self._rng
+        )
+        if fit is None or not is_possible(fit, self._config):
             return _lost(window, fit)
         self._state = fit.state
         self._verdict = Verdict()
@@ -148,13 +165,15 @@ class PoseTracker:
         self._state = None
         self._lost_count = 0
 
-    def _wandered(self) -> SE3:
-        """Where to look: the last pose that could be relied on, and ever farther around it."""
-        if self._lost_count == 1:
-            return self._last
-        lost_s = min(self._lost_count * self._config.interval_us * 1e-6, MAX_WANDER_S)
-        deviation = [np.deg2rad(WANDER_DEG_S)] * 3 + [WANDER_M_S] * 3
-        return self._last.retract(self._rng.normal(size=6) * deviation * lost_s)
+    def _place_to_look(self, t_us: int) -> SE3:
+        """Where the last motion that could be relied on leads or began, and ever farther around it."""
+        went_on = self._lost_count % 2 == 1
+        after_s = (t_us - self._last.t_us) * 1e-6 if went_on else 0.0
+        place = self._last.poses(np.array(np.clip(after_s, 0.0, MAX_COAST_S)))
+        lost_s = (self._lost_count - 1) * self._config.interval_us * 1e-6
+        deviation = np.array([np.deg2rad(WANDER_DEG_S)] * 3 + [WANDER_M_S] * 3)
+        wandered = self._rng.normal(size=6) * deviation * min(lost_s, MAX_WANDER_S)
+        return place.retract(wandered)
 
 
 def _told(window: Window, status: PoseStatus, fit: WindowFit) -> TrackedPose:

@@ -10,50 +10,65 @@ from roel_service.tracking.fit import WindowFit
 
 # Fewer pieces of lines that are seen do not hold a pose against chance.
 MIN_SEEN_COUNT = 6
-# So many windows in a row must agree before a pose that was found anew may be relied on, and so
-# many must disagree before a pose is given up; one that hardly agrees at all is given up at once.
-CONFIRMED_COUNT, DOUBTED_COUNT = 3, 3
-HARDLY = 0.5
+# Of what convinces, this share or less contradicts.
+CONTRADICTING_SHARE = 0.3
+# So many windows in a row must convince before a pose is relied on. It is given up when so many
+# contradict, or when it has not convinced for so many.
+CONVINCED_COUNT, CONTRADICTED_COUNT, PATIENCE_COUNT = 4, 3, 20
 # A state this many deviations from the forecast is no continuation of the motion (12 unknowns).
 MAX_SURPRISE = 8.0
 
 
-def agrees(fit: WindowFit, config: TrackConfig) -> bool:
+def convinces(fit: WindowFit, config: TrackConfig) -> bool:
+    """Whether events lie on the lines that must have some, and hardly any beside them."""
+    return is_possible(fit, config) and fit.evidence.sharpness >= config.min_sharpness
+
+
+def is_possible(fit: WindowFit, config: TrackConfig) -> bool:
     """Whether events lie on the lines that must have some."""
     evidence = fit.evidence
     return (
         evidence.seen_count >= MIN_SEEN_COUNT
         and evidence.seen_share >= config.min_seen_share
-        and evidence.sharpness >= config.min_sharpness
+        and evidence.sharpness >= CONTRADICTING_SHARE * config.min_sharpness
     )
 
 
 class Verdict:
-    """Follows the agreement of the windows since a pose was found."""
+    """Follows what the windows say since a pose was found."""
 
     def __init__(self) -> None:
-        self._agreed_count = 0
-        self._doubted_count = 0
+        self._convinced_count = 0
+        self._unconvinced_count = 0
+        self._contradicted_count = 0
 
     def of(self, fit: WindowFit, config: TrackConfig) -> PoseStatus:
         """The status of the next window's pose."""
-        if agrees(fit, config):
-            self._agreed_count += 1
-            self._doubted_count = 0
-        elif not fit.evidence.is_still:
-            self._doubted_count += 1
-        hardly = fit.evidence.seen_share < HARDLY * config.min_seen_share
-        if self._doubted_count >= DOUBTED_COUNT or (self._doubted_count and hardly):
-            return PoseStatus.LOST
-        is_sure = (
-            self._doubted_count == 0
-            and self._agreed_count > CONFIRMED_COUNT
-            and fit.surprise <= MAX_SURPRISE
-            and _is_known(fit, config)
+        self._count(fit, config)
+        is_elsewhere = (
+            self._contradicted_count > 0
+            and fit.evidence.seen_share < CONTRADICTING_SHARE * config.min_seen_share
         )
-        if fit.surprise > MAX_SURPRISE:
-            self._agreed_count = 0
+        if (
+            is_elsewhere
+            or self._contradicted_count >= CONTRADICTED_COUNT
+            or self._unconvinced_count >= PATIENCE_COUNT
+        ):
+            return PoseStatus.LOST
+        is_sure = self._convinced_count >= CONVINCED_COUNT and _is_known(fit, config)
         return PoseStatus.TRACKING if is_sure else PoseStatus.UNCERTAIN
+
+    def _count(self, fit: WindowFit, config: TrackConfig) -> None:
+        if fit.evidence.is_still:
+            # Nothing for or against it.
+            return
+        if convinces(fit, config) and fit.surprise <= MAX_SURPRISE:
+            self._convinced_count += 1
+            self._unconvinced_count = self._contradicted_count = 0
+            return
+        self._convinced_count = 0
+        self._unconvinced_count += 1
+        self._contradicted_count = 0 if is_possible(fit, config) else self._contradicted_count + 1
 
 
 def _is_known(fit: WindowFit, config: TrackConfig) -> bool:
