@@ -120,6 +120,7 @@ _ROWS = (
         "a map of fewer than three lines, or too few lines in view to hold poses",
     ),
     Reason("NOT_REGISTERED", NoAnswerError, "a registration not to be relied on, with `--strict`"),
+    Reason("NOT_TRACKED", NoAnswerError, "a recording with hardly a pose to be relied on"),
     Reason("NOT_LOCATED", NoAnswerError, "a panorama without a pose to rely on, with `--strict`"),
     Reason("NOT_FOUND", NotFoundError, "a resource that does not exist"),
     Reason(

@@ -130,10 +130,9 @@ def test_a_guess_is_where_the_search_begins(followed, version, room, first):
     chunks = room.chunks()
     answers = followed(
         setup(version, far_off),
-        chunk(7, chunks[0]),
-        chunk(8, chunks[1]),
-        {"guess": guess_to_proto(room.pose(100_000))},
-        *(chunk(9 + index, part) for index, part in enumerate(chunks[2:])),
+        *(chunk(7 + index, part) for index, part in enumerate(chunks[:4])),
+        {"guess": guess_to_proto(room.pose(125_000))},
+        *(chunk(11 + index, part) for index, part in enumerate(chunks[4:])),
     )
     assert answers[0].status == localization_pb2.TrackPosesResponse.STATUS_LOST
     assert not answers[0].HasField("T_world_camera")

@@ -25,6 +25,7 @@ from roel_client.cli import (
     register,
     serve,
     simulate,
+    track,
 )
 from roel_client.cli.output import (
     LogHandler,
@@ -148,6 +149,7 @@ def parser() -> Parser:
         localize,
         batch,
         poses,
+        track,
         evaluate,
         simulate,
         bench,
