@@ -169,9 +169,13 @@ def trial(
         began_s = time.process_time()
         poses = tracker.push(events)
         busy_s += time.process_time() - began_s
-        # A pose belongs to before the cut even if the events that complete it come after.
+        # A pose whose events are of both sides of the cut belongs to before it.
         told += [
-            (pose, pose.t_us + (behind_us if cut_us and pose.t_us > cut_us[0] else 0))
+            (
+                pose,
+                pose.t_us
+                + (behind_us if cut_us and pose.t_us > cut_us[0] + config.interval_us // 2 else 0),
+            )
             for pose in poses
         ]
     errors, nees = _errors(walk.trajectory, told)
