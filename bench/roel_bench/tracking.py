@@ -3,7 +3,7 @@
 `follow` begins 20 cm and 10 degrees off and follows the whole walk; `start` does so for a moment, from
 many places of the walk; `jump` leaves out a third of a second of the events, then a second, as if the camera
 had been carried blindfold; `elsewhere` follows the walk in the map of another room. A pose that is told as TRACKING is
-wrong when it is more than 5 cm or 2 degrees off.
+wrong when it is more than 5 cm or 2 degrees off. Maps are read as `roel map export` writes them (.npz).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from roel_service.geometry.se3 import SE3
 from roel_service.io.camera import read_camera
 from roel_service.io.events import open_events
 from roel_service.io.files import whole_file
+from roel_service.io.maps import read_exported_map
 from roel_service.io.poses import read_trajectory
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource, EventStream
@@ -32,7 +33,6 @@ from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
 from roel_service.scene.trajectory import Trajectory
 from roel_service.tracking.tracker import FINDING_HALF_US, PoseTracker
-from roel_service.wire.rlm import decode_map
 
 FORMAT = "roel tracking benchmark 1"
 WRONG_M, WRONG_DEG = 0.05, 2.0
@@ -98,7 +98,7 @@ def open_walk(folder: Path, map_path: Path) -> Walk:
         events=open_events(folder / "events.h5", camera.width, camera.height),
         camera=camera,
         trajectory=read_trajectory(folder / "poses.txt"),
-        line_map=decode_map(map_path.read_bytes()).line_map,
+        line_map=read_exported_map(map_path),
     )
 
 
@@ -273,15 +273,14 @@ def _cells(row: Trial) -> list[str]:
 def main() -> None:
     """Run what the command line names, and write and print its rows."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--walk", action="append", nargs=2, required=True, metavar=("DIR", "MAP"))
-    parser.add_argument("--elsewhere", action="append", default=[], metavar="MAP")
+    parser.add_argument(
+        "--walk", action="append", nargs=2, required=True, metavar=("DIR", "MAP.npz")
+    )
+    parser.add_argument("--elsewhere", action="append", default=[], metavar="MAP.npz")
     parser.add_argument("--kinds", nargs="+", default=["follow", "start", "jump", "elsewhere"])
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()
-    others = [
-        (Path(name).stem, decode_map(Path(name).read_bytes()).line_map)
-        for name in options.elsewhere
-    ]
+    others = [(Path(name).stem, read_exported_map(Path(name))) for name in options.elsewhere]
     rows: list[Trial] = []
     for folder, map_name in options.walk:
         walk = open_walk(Path(folder), Path(map_name))

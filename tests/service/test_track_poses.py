@@ -138,7 +138,9 @@ def test_a_guess_is_where_the_search_begins(followed, version, room, first):
     assert not answers[0].HasField("T_world_camera")
     assert answers[-1].HasField("T_world_camera")
     assert {answer.map_version for answer in answers} == {version}
-    assert answers[-1].seq == 7 + len(chunks) - 1
+    # The last chunk may complete no pose.
+    assert sorted(answer.seq for answer in answers) == [answer.seq for answer in answers]
+    assert 7 + len(chunks) - 2 <= answers[-1].seq < 7 + len(chunks)
 
 
 def test_events_before_the_beginning_are_passed_over(client, version, room):
