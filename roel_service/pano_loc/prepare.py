@@ -6,10 +6,8 @@ map lies in the world.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -40,9 +38,6 @@ MIN_PLACE_COUNT, MAX_PLACE_COUNT = 400, 12000
 # Shorter lines are more noise than line.
 MIN_LINE_M = 0.05
 
-
-# Grows with every change of what is prepared.
-PREPARATION_VERSION = 1
 
 Arrays = Mapping[str, Array]
 
@@ -86,7 +81,7 @@ class PreparedMap:
         )
 
     def to_arrays(self) -> Arrays:
-        """For keeping it; under a name that `preparation_key` gives."""
+        """For keeping it."""
         plain = {name: value for name, value in vars(self).items() if name not in _PARTS}
         parts = {
             f"{name}_{key}": value
@@ -108,13 +103,6 @@ class PreparedMap:
 
 
 _PARTS: dict[str, Any] = {"lines": ClassedLines, "views": Views}
-
-
-def preparation_key(map_digest: str, config: LocalizeConfig) -> str:
-    """Names the preparation of a map: equal keys, equal arrays."""
-    parameters = json.dumps(asdict(config), sort_keys=True)
-    text = f"{map_digest} {PREPARATION_VERSION} {parameters}"
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:

@@ -8,7 +8,6 @@ from roel_service.pano_loc.prepare import (
     MIN_PLACE_COUNT,
     PreparedMap,
     free_places,
-    preparation_key,
     prepare_map,
 )
 from tests.pano_loc.rooms import map_of, segments_of
@@ -54,11 +53,3 @@ def test_a_prepared_map_is_kept_as_plain_arrays():
     for name, value in first.items():
         np.testing.assert_array_equal(second[name], value)
     assert again.step_m == prepared.step_m
-
-
-def test_the_key_of_a_preparation_tells_maps_and_parameters_apart():
-    config = LocalizeConfig()
-    key = preparation_key("sha256:1", config)
-    assert key == preparation_key("sha256:1", LocalizeConfig())
-    assert key != preparation_key("sha256:2", config)
-    assert key != preparation_key("sha256:1", LocalizeConfig(grid_step_m=0.5))
