@@ -9,7 +9,7 @@ BASELINE := proto/baseline.binpb
 WEIGHTS := .venv/.weights
 LIMAP_INSTALLED := .venv-limap/.installed
 
-.PHONY: demo learned test check stubs-are-current baseline no-large-files format proto docs bench crash accuracy limap serve
+.PHONY: demo learned test check style types stubs-are-current baseline no-large-files format proto docs bench crash accuracy limap serve
 
 demo: $(INSTALLED)  ## simulate a room, map it, show what came out
 	rm -rf demo-out
@@ -20,12 +20,16 @@ learned: $(WEIGHTS)  ## the learned point matchers with their weights
 test: check $(WEIGHTS)  ## what a change must pass; PYTEST_ARGS="-m ''" adds the slow tests
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
-check: $(INSTALLED) stubs-are-current no-large-files  ## all that can be said without running the code
+check: stubs-are-current no-large-files style types  ## all that can be said without running the code
+
+style: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/hadolint Dockerfile
+
+types: $(INSTALLED)
+	$(BIN)/mypy
 
 format: $(INSTALLED)
 	$(BIN)/ruff format .
@@ -81,7 +85,9 @@ $(INSTALLED): pyproject.toml .ci/system_libraries
 	.ci/system_libraries
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "Installing into .venv; the first time takes some minutes."
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[dev]'
+	@# What pip would do on one core alone; files of other Pythons, which packages bring along, fail.
+	@$(BIN)/python -W ignore -m compileall -qq -j 0 .venv/lib || true
 	@touch $@
 
 $(LIMAP_INSTALLED): Makefile

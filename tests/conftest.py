@@ -9,6 +9,10 @@ from hypothesis import settings
 # Some tests fork in a process in which others have used gRPC. Its fork handlers are for children that
 # go on using it, which none does; where they cannot run they say so on stderr.
 os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
+# As in the children of the service and of the command: what they and the library find is compared bit
+# by bit, and sums over several threads have another order.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[name] = "1"
 
 # No limit on time: a busy machine is no failure. Few examples, drawn anew in every run.
 settings.register_profile("project", deadline=None, max_examples=30)

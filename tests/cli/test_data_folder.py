@@ -24,7 +24,7 @@ def test_problems_are_an_answer_of_their_own(folder, capfd):
     with Store(folder) as store, store._database.write() as connection:
         connection.exec_driver_sql(
             "INSERT INTO operation SELECT 'o', 'BuildMap', '', 'house', 1, 'walk', 'queued', '',"
-            " 0, 0, 0, x'', x'', x'', 1, 1, 0, 0"
+            " 0, 0, 0, x'', x'', x'', 1, 1, 0, 0, ''"
         )
     assert main(["admin", "fsck", "--data", str(folder), "--json"]) == 3
     printed = capfd.readouterr()

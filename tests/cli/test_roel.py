@@ -167,6 +167,7 @@ def test_report_of_a_build_without_answer_is_printed_as_json(recording: Recordin
     assert not (recording.folder / "map.rlm").exists()
 
 
+@pytest.mark.slow
 def test_server_answers_as_the_local_build_does(recording: Recording, server: str) -> None:
     assert roel("health", "--server", server, cwd=recording.folder).stdout == "SERVING\n"
     done = recording.build("--server", server)

@@ -163,8 +163,9 @@ def test_compressed_points_ask_for_their_extra(tmp_path, monkeypatch):
 
 def test_clouds_as_laz(tmp_path):
     laspy = pytest.importorskip("laspy")
-    cloud = laspy.LasData(laspy.LasHeader(point_format=0, version="1.2"))
-    cloud.header.scales = [1e-3, 1e-3, 1e-3]
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.scales = np.full(3, 1e-3)
+    cloud = laspy.LasData(header)
     cloud.xyz = SCATTER.astype(np.float64)
     cloud.write(str(tmp_path / "a.laz"))
     np.testing.assert_allclose(read_cloud(tmp_path / "a.laz").points, SCATTER, atol=0.0006)

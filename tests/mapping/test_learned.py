@@ -64,7 +64,14 @@ def shifted_pair(width=346, height=260):
 
 
 @needs_weights
-@pytest.mark.parametrize("name", ["xfeat", "aliked", "disk"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "xfeat",
+        pytest.param("aliked", marks=pytest.mark.slow),
+        pytest.param("disk", marks=pytest.mark.slow),
+    ],
+)
 class TestLightGlueMatchers:
     def test_a_shifted_image_gives_the_shift(self, name, monkeypatch):
         # A quarter of the pixels: seconds instead of half a minute.

@@ -97,7 +97,7 @@ class TestTogetherWithTheLines:
 class TestAClockThatIsOff:
     """Poses that are stamped 30 ms late."""
 
-    @pytest.mark.parametrize("estimate", [False, True])
+    @pytest.mark.parametrize("estimate", [False, pytest.param(True, marks=pytest.mark.slow)])
     def test_it_is_told_or_mended(self, estimate, caplog):
         truth = trajectory()
         late = Trajectory(t_us=truth.t_us + 30_000, T_world_camera=truth.T_world_camera)
