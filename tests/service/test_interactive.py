@@ -348,10 +348,12 @@ class TestRegister:
             call(version, **{**target, **fields})
 
     def test_a_caller_who_goes_away_frees_the_child(self, client, version, cloud, line_map):
-        # Poses are looked for from thousands of guesses, of which none is right.
-        endless = dataclasses.replace(COARSE, voxel_m=0.01, gravity_aligned=False)
+        # A thousand guesses are followed up, which takes many times as long as the caller waits.
+        endless = dataclasses.replace(
+            COARSE, voxel_m=0.01, candidate_count=1000, gravity_aligned=False
+        )
         with pytest.raises(UnavailableError):
-            client.register(version, cloud, method="global", config=endless, timeout_s=0.3)
+            client.register(version, cloud, method="global", config=endless, timeout_s=0.1)
         assert client.register(version, cloud, config=COARSE).converged
 
 
