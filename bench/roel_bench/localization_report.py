@@ -25,6 +25,7 @@ from roel_bench.localization import (
     read_results,
 )
 from roel_bench.localization_places import HOUSE, HOUSE_OUTSIDE, HOUSE_ROOM, ROOM, SYMMETRIC
+from roel_bench.results import machine_text
 from roel_bench.tables import MISSING, number, table, write_text
 from roel_service.io.files import read_input
 
@@ -57,11 +58,8 @@ def page(results: Results, text: str) -> str:
 
 def measured(results: Results) -> str:
     """All tables."""
-    machine = results.machine
-    versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
     told = (
-        f"{machine['processor']}, {machine['core_count']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {versions}. Seconds are those of the processor, one"
+        f"{machine_text(results.machine, results.versions)}. Seconds are those of the processor, one"
         " thread; the machine did other work at the same time, so they are upper bounds.\n"
     )
     cells = results.cells

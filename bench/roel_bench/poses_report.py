@@ -9,6 +9,7 @@ import numpy as np
 from roel_bench.poses import PoseResults, read_results
 from roel_bench.poses_cube import METHODS, CubeRow
 from roel_bench.poses_rooms import PoseErrors, RoomRow
+from roel_bench.results import machine_text
 from roel_bench.tables import table, write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -52,12 +53,7 @@ its poses: refinement cannot know that the world of the given poses lies off.
 
 def document(results: PoseResults) -> str:
     """The whole page."""
-    machine = results.machine
-    versions = ", ".join(f"{name} {version}" for name, version in results.versions.items())
-    told = (
-        f"{machine['processor']}, {machine['core_count']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {versions}. Seconds are processor time.\n"
-    )
+    told = f"{machine_text(results.machine, results.versions)}. Seconds are processor time.\n"
     blocks = [INTRODUCTION, told, CUBE, _cube_table(results.cube), "\n" + ROOMS]
     blocks += [_errors_table(results.rooms), "\n" + MAPS, _map_table(results.rooms)]
     return "\n".join(blocks) + "\n"

@@ -11,6 +11,7 @@ import numpy as np
 from roel_bench.registration import FOUND_DEG, FOUND_MM, read_document
 from roel_bench.registration_places import LARGE, ROOM, SYMMETRIC
 from roel_bench.registration_scans import SCAN
+from roel_bench.results import machine_text
 from roel_bench.tables import table, write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -87,11 +88,9 @@ Trials = list[dict[str, Any]]
 def document(results: dict[str, Any]) -> str:
     """The whole page."""
     trials: Trials = results["trials"]
-    machine = results["machine"]
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     told = (
-        f"{machine['processor']}, {machine['core_count']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {versions}. The machine did other work at the same time, which slows"
+        f"{machine_text(results['machine'], results['versions'])}."
+        " The machine did other work at the same time, which slows"
         " processors that share caches: times are upper bounds, and comparable with one another.\n"
     )
     rooms = [trial for trial in trials if trial["kind"] == ROOM]

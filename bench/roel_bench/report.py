@@ -18,7 +18,7 @@ from roel_bench.catalogue import (
 )
 from roel_bench.disturbances import DISTURBANCES, NOISY_POSES
 from roel_bench.methods import PEERS
-from roel_bench.results import NO_DISTURBANCE, Results, Row, read_results
+from roel_bench.results import NO_DISTURBANCE, Results, Row, machine_text, read_results
 from roel_bench.suites import FRONT_END, MAP, PRESET_NAMES
 from roel_bench.tables import (
     CURVE_COLUMNS,
@@ -107,14 +107,12 @@ def _scenes(report: _Report) -> str:
     machine, versions = report.results.machine, report.results.versions
     tuning = ", ".join(f"`{name}`" for name in TUNING_ROOMS)
     reporting = ", ".join(f"`{name}`" for name in REPORTING_ROOMS)
-    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
     text = (
         f"Parameters were chosen by looking at {tuning} and at simulated rooms of the seeds"
         f" {TUNING_SEEDS.start} to {TUNING_SEEDS.stop - 1}; their rows are marked and count in no"
         f" mean. Figures are reported on {reporting} (seed, sensor, seconds), which nobody looked at"
         " before.\n\n"
-        f"{machine['processor']}, {machine['core_count']} cores, {machine['system']}, Python"
-        f" {machine['python']}; {packages}."
+        f"{machine_text(machine, versions)}."
     )
     return _section("Scenes and machine", text)
 

@@ -7,7 +7,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 
 from roel_service import __version__
 from roel_service.config.load import to_tables
-from roel_service.config.stages import Config
+from roel_service.config.stages import AFTER_MAPPING, Config
 from roel_service.errors import InputError
 from roel_service.io.files import read_input, whole_file
 
@@ -113,6 +113,15 @@ def this_machine() -> Results:
     )
 
 
+def machine_text(machine: Mapping[str, Any], versions: Mapping[str, str]) -> str:
+    """A machine and its packages, as reports tell them."""
+    packages = ", ".join(f"{name} {version}" for name, version in versions.items())
+    return (
+        f"{machine['processor']}, {machine['core_count']} cores, {machine['system']}, Python"
+        f" {machine['python']}; {packages}"
+    )
+
+
 def _processor() -> str:
     """The processor's own name where Linux tells it."""
     try:
@@ -129,7 +138,8 @@ def config_digest(config: Config) -> str:
     A stage that is off leaves no trace: rows from before there was one stay valid.
     """
     tables = to_tables(config)
-    del tables["runtime"], tables["register"]
+    for table in ("runtime", *AFTER_MAPPING):
+        del tables[table]
     if config.curves.method == "none":
         del tables["curves"]
     return digest_of(json.dumps(tables, sort_keys=True))

@@ -561,6 +561,10 @@ class CurvesConfig(Stage, table="curves"):
     overlap_distance_px: float = parameter(2.5, NOT_NEGATIVE)
 
 
+# Tables of what is done with a finished map: they cannot change one.
+AFTER_MAPPING = ("register", "localize", "track")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Config:
     """Every parameter of a run, one attribute for each TOML table."""

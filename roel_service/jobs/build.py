@@ -16,13 +16,7 @@ import numpy as np
 
 from roel_service import __version__
 from roel_service.config.load import to_tables, to_toml
-from roel_service.config.stages import (
-    Config,
-    LocalizeConfig,
-    RegisterConfig,
-    RuntimeConfig,
-    TrackConfig,
-)
+from roel_service.config.stages import AFTER_MAPPING, Config, RuntimeConfig
 from roel_service.errors import NoAnswerError
 from roel_service.jobs.following import follow
 from roel_service.jobs.inputs import BuildParameters, FollowParameters
@@ -170,13 +164,9 @@ def build_map(
 def config_digest(config: Config) -> str:
     """Digest of every parameter that can change a map; the number of workers cannot."""
     runtime = RuntimeConfig(seed=config.runtime.seed)
-    of_maps = dataclasses.replace(
-        config,
-        runtime=runtime,
-        register=RegisterConfig(),
-        localize=LocalizeConfig(),
-        track=TrackConfig(),
-    )
+    defaults = Config()
+    others = {table: getattr(defaults, table) for table in AFTER_MAPPING}
+    of_maps = dataclasses.replace(config, runtime=runtime, **others)
     text = to_toml(of_maps)
     return f"sha256:{hashlib.sha256(text.encode()).hexdigest()}"
 

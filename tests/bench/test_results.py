@@ -47,6 +47,19 @@ def test_digest_follows_parameters_but_not_the_runtime():
     assert config_digest(default) == config_digest(workers) != config_digest(other)
 
 
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"localize": {"grid_step_m": 0.5}},
+        {"register": {"voxel_m": 0.5}},
+        {"track": {"interval_us": 20_000}},
+    ],
+)
+def test_digest_does_not_follow_what_is_done_with_a_map(tables):
+    default = preset("default")
+    assert config_digest(with_tables(default, tables, subject="sample")) == config_digest(default)
+
+
 def test_milliseconds_a_frame_are_of_all_stages():
     assert row().ms_per_frame == 100.0
     assert row(frame_count=0).ms_per_frame is None
