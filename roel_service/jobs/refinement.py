@@ -14,6 +14,7 @@ from roel_service.jobs.build import build_map, built_version
 from roel_service.jobs.refine_inputs import RefineParameters
 from roel_service.jobs.task import Tell
 from roel_service.mapping import refine_poses as poses
+from roel_service.mapping.pipeline import POSES_SHARE
 from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
@@ -22,9 +23,6 @@ from roel_service.scene.results import PoseResult
 from roel_service.scene.trajectory import Trajectory
 from roel_service.store.refinements import RefinedPoses
 from roel_service.wire.nouns import trajectory_to_proto
-
-# Share of the work, where lines are wanted too.
-POSES_SHARE = 0.6
 
 
 def refine_poses(

@@ -139,7 +139,7 @@ def refine_poses(
         if index + 1 == count or not left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT):
             break
         applied_us += round(left.offset_us)
-    report = _report(found, trajectory, config, applied_us, seconds)
+    report = _report(found, left, trajectory, config, applied_us, seconds)
     for problem in report.problems:
         logger.warning("poses: %s", PROBLEMS[problem])
     return PoseResult(
@@ -198,6 +198,7 @@ def _as_large_as(poses: SE3, given: SE3) -> SE3:
 
 def _report(
     found: _Found,
+    left: TimeOffset,
     trajectory: Trajectory,
     config: Config,
     applied_us: int,
@@ -206,7 +207,6 @@ def _report(
     rounds = found.rounds
     observation_count = len(found.refined.tracks.observation)
     px2 = config.refine.pose_noise_px**2 / max(1, observation_count)
-    left = found.time_offset
     return PoseReport(
         line_count=len(found.refined),
         observation_count=observation_count,

@@ -83,7 +83,6 @@ def bench_mapping(options: argparse.Namespace, staged: Staged) -> None:
 
 
 def _add_registration(group: Subparsers) -> None:
-    # The file is no staged output: it keeps the trials of an interrupted run, for the next one.
     what = Command(run=bench_registration)
     parser = command(group, "registration", "maps against clouds of their places", what)
     parser.add_argument(
@@ -95,6 +94,19 @@ def _add_registration(group: Subparsers) -> None:
         help="a map and the cloud of the same place in the same frame; may be repeated",
     )
     parser.add_argument(
+        "--large",
+        action="store_true",
+        help="all places side by side too, cut to 2,500 lines and 400,000 points",
+    )
+    parser.add_argument(
+        "--scans", metavar="DIR", help="folder of real scans with transforms between them"
+    )
+    _add_trial_options(parser)
+
+
+def _add_trial_options(parser: argparse.ArgumentParser) -> None:
+    # The file is no staged output: it keeps the trials of an interrupted run, for the next one.
+    parser.add_argument(
         "--out",
         required=True,
         type=suffixed(".json"),
@@ -102,19 +114,11 @@ def _add_registration(group: Subparsers) -> None:
         help="every trial; what it holds is not run again",
     )
     parser.add_argument(
-        "--large",
-        action="store_true",
-        help="all places side by side too, cut to 2,500 lines and 400,000 points",
-    )
-    parser.add_argument(
         "--symmetric",
         type=integer(0, 1000),
         default=0,
         metavar="N",
         help="so many symmetric rooms of boxes, made by chance",
-    )
-    parser.add_argument(
-        "--scans", metavar="DIR", help="folder of real scans with transforms between them"
     )
     parser.add_argument(
         "--trials", type=integer(1, 1000), metavar="N", help="at most so many of each kind"
@@ -140,16 +144,8 @@ def bench_registration(options: argparse.Namespace, staged: Staged) -> None:
 
 
 def _add_localization(group: Subparsers) -> None:
-    # The file is no staged output: it keeps the cells of an interrupted run, for the next one.
     what = Command(run=bench_localization)
     parser = command(group, "localization", "panoramas in maps of their places", what)
-    parser.add_argument(
-        "--out",
-        required=True,
-        type=suffixed(".json"),
-        metavar="FILE.json",
-        help="every trial; what it holds is not run again",
-    )
     parser.add_argument(
         "--room",
         action="append",
@@ -163,13 +159,6 @@ def _add_localization(group: Subparsers) -> None:
         nargs=2,
         metavar=("LINES.npz", "PANOS"),
         help="lines of a house with the names of their rooms, and a folder of photographs",
-    )
-    parser.add_argument(
-        "--symmetric",
-        type=integer(0, 1000),
-        default=0,
-        metavar="N",
-        help="so many symmetric rooms of boxes, made by chance",
     )
     parser.add_argument(
         "--protocols",
@@ -187,11 +176,8 @@ def _add_localization(group: Subparsers) -> None:
         metavar="NAME",
         help=f"only these of {', '.join(LOCALIZATION_METHODS)}",
     )
-    parser.add_argument(
-        "--trials", type=integer(1, 1000), metavar="N", help="at most so many of each kind"
-    )
+    _add_trial_options(parser)
     parser.add_argument("--again", action="store_true", help="run what the file holds, too")
-    parser.add_argument("--json", action="store_true", help="print all trials as JSON")
 
 
 def bench_localization(options: argparse.Namespace, staged: Staged) -> None:
