@@ -54,7 +54,7 @@ run; means are over rooms. Simulated rooms have an ideal sensor: real ones do wo
 
 @dataclass(frozen=True, kw_only=True)
 class _Report:
-    """The rows of a report, the newest of each scene and method, and the means over them."""
+    """The rows of a report and the means over them."""
 
     results: Results
     rows: tuple[Row, ...]
@@ -62,9 +62,9 @@ class _Report:
 
     @staticmethod
     def of(results: Results) -> _Report:
-        newest = {(row.task, row.scene, row.disturbance, row.method): row for row in results.rows}
-        rows = tuple(newest.values())
-        return _Report(results=results, rows=rows, maps=Maps(rows, with_tuning=False))
+        return _Report(
+            results=results, rows=results.rows, maps=Maps(results.rows, with_tuning=False)
+        )
 
     def frames(self, method: str, scenes: Iterable[str] | None = None) -> list[Row]:
         """Rows of single frames; by default of all rooms that count."""

@@ -38,7 +38,7 @@ class Row:
         scene, sensor, is_tuning: the scene, its size WxH, and whether it counts in no mean.
         disturbance: what was done to the scene, or `none`.
         method: name of the variant or of the peer.
-        config_digest: of every parameter of the method.
+        config_digest: of every parameter of the method; tells whether the row is still true.
         figures: by name; None where there is no figure, e.g. the accuracy of an empty map.
         seconds: wall-clock time of each stage.
         frame_count, event_count: frames looked at, 0 for a method without frames; events read.
@@ -64,8 +64,8 @@ class Row:
 
     @property
     def key(self) -> tuple[str, ...]:
-        """What tells rows apart: a second row of the same key would say the same."""
-        return (self.task, self.scene, self.disturbance, self.method, self.config_digest)
+        """What tells rows apart; a row with other parameters takes the place of the older one."""
+        return (self.task, self.scene, self.disturbance, self.method)
 
     @property
     def ms_per_frame(self) -> float | None:
@@ -135,13 +135,16 @@ def _processor() -> str:
 def config_digest(config: Config) -> str:
     """Twelve hexadecimal digits that change with any parameter of mapping.
 
-    A stage that is off leaves no trace: rows from before there was one stay valid.
+    What is off leaves no trace: rows from before it was there stay valid.
     """
     tables = to_tables(config)
     for table in ("runtime", *AFTER_MAPPING):
         del tables[table]
     if config.curves.method == "none":
         del tables["curves"]
+    if not config.refine.free_poses:
+        refine = tables["refine"]
+        tables["refine"] = {key: refine[key] for key in refine if not key.startswith("pose_")}
     return digest_of(json.dumps(tables, sort_keys=True))
 
 

@@ -65,7 +65,7 @@ class Runner:
     _warm: set[str] = field(default_factory=set)
 
     def run(self, cells: Iterable[Cell]) -> Results:
-        """Run the cells that the folder has no row of yet, or one that only tells of an error.
+        """Run the cells that the folder has no row of yet, or one of an error or other parameters.
 
         Raises:
             InputError: an unknown scene; a folder that cannot be written, or that holds results
@@ -74,12 +74,13 @@ class Runner:
         """
         cells = list(cells)
         openers = {name: find_scene(name, self.places) for name in {c.scene for c in cells}}
-        keys = [_key(cell) for cell in cells]
+        digests = [_digest(cell) for cell in cells]
         results = self._results()
         scene: Scene | None = None
         truths = _FrameTruths()
-        for index, (cell, key) in enumerate(zip(cells, keys, strict=True)):
-            if key in {row.key for row in results.rows if not row.error}:
+        for index, (cell, digest) in enumerate(zip(cells, digests, strict=True)):
+            known = {row.key: row.config_digest for row in results.rows if not row.error}
+            if known.get(cell.key) == digest:
                 continue
             step = self._step(cell, index, len(cells))
             if scene is None or scene.name != cell.scene:
@@ -249,13 +250,11 @@ def _failed(cell: Cell, scene: Scene, method: Method, error: NoAnswerError) -> R
     )
 
 
-def _key(cell: Cell) -> tuple[str, ...]:
-    """The key of the row that a cell would give."""
+def _digest(cell: Cell) -> str:
+    """Of every parameter of the method, as its row would carry it."""
     if cell.task == FRONT_END:
-        digest = config_digest(find_variant(cell.method).config)
-    else:
-        digest = find_method(cell.method).digest
-    return (cell.task, cell.scene, cell.disturbance, cell.method, digest)
+        return config_digest(find_variant(cell.method).config)
+    return find_method(cell.method).digest
 
 
 def _spread(frames: list[FrameLines]) -> list[FrameLines]:

@@ -46,6 +46,11 @@ class Cell:
     method: str
     disturbance: str = NO_DISTURBANCE
 
+    @property
+    def key(self) -> tuple[str, ...]:
+        """The key of the row that it gives."""
+        return (self.task, self.scene, self.disturbance, self.method)
+
 
 def _cells(
     task: str, scenes: Iterable[str], methods: Iterable[str], disturbance: str = NO_DISTURBANCE

@@ -35,7 +35,7 @@ def test_figures_are_written_with_six_digits_and_without_nan(tmp_path):
 def test_a_row_takes_the_place_of_the_older_one_of_its_key():
     first = row(figures={"iou_20": 0.1})
     other = row(method="paper")
-    again = replace(first, figures={"iou_20": 0.2})
+    again = replace(first, figures={"iou_20": 0.2}, config_digest="1" * 12)
     results = EMPTY.with_row(first).with_row(other).with_row(again)
     assert results.rows == (other, again)
 
@@ -53,11 +53,26 @@ def test_digest_follows_parameters_but_not_the_runtime():
         {"localize": {"grid_step_m": 0.5}},
         {"register": {"voxel_m": 0.5}},
         {"track": {"interval_us": 20_000}},
+        {"curves": {"piece_length_px": 12.0}},
+        {"refine": {"pose_drift_m": 0.01}},
     ],
 )
-def test_digest_does_not_follow_what_is_done_with_a_map(tables):
+def test_digest_does_not_follow_what_no_line_depends_on(tables):
     default = preset("default")
     assert config_digest(with_tables(default, tables, subject="sample")) == config_digest(default)
+
+
+@pytest.mark.parametrize(
+    ("on", "parameter"),
+    [
+        ({"curves": {"method": "polyline"}}, {"curves": {"piece_length_px": 12.0}}),
+        ({"refine": {"free_poses": True}}, {"refine": {"pose_drift_m": 0.01}}),
+    ],
+)
+def test_digest_follows_the_parameters_of_what_is_on(on, parameter):
+    config = with_tables(preset("default"), on, subject="sample")
+    other = with_tables(config, parameter, subject="sample")
+    assert config_digest(other) != config_digest(config) != config_digest(preset("default"))
 
 
 def test_milliseconds_a_frame_are_of_all_stages():

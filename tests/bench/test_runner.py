@@ -70,6 +70,14 @@ def test_rows_that_are_there_are_not_run_again(folder, places):
     assert (folder / FILE_NAME).stat().st_mtime_ns == before
 
 
+def test_a_row_of_other_parameters_is_run_again_and_replaced(folder, places, tmp_path):
+    done = read_results(folder / FILE_NAME).rows[0]
+    stale = replace(done, config_digest="0" * 12, figures={"iou_20": 0.123})
+    write_results(tmp_path / FILE_NAME, replace(read_results(folder / FILE_NAME), rows=(stale,)))
+    (row,) = Runner(places=places, folder=tmp_path).run(CELLS[:1]).rows
+    assert (row.config_digest, row.figures) == (done.config_digest, done.figures)
+
+
 def test_an_interrupted_run_goes_on(folder, places, tmp_path):
     done = read_results(folder / FILE_NAME)
     write_results(tmp_path / FILE_NAME, replace(done, rows=done.rows[:2]))
