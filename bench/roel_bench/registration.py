@@ -3,7 +3,8 @@
 The paper's protocol turns the start about yaw, pitch and roll one after the other, 10 degrees standard
 deviation each, and then shifts it by 2 cm; `wide` is any start up to 30 degrees and 0.3 m off; `heading`
 and `free` move the whole map anywhere, and ask for it without a first guess; `elsewhere` asks for it in
-the cloud of another place, and `partial` in 70 % of its own cloud.
+the cloud of another place, and `partial` in 70 % of its own cloud. `unit` is `heading` for a map whose unit
+is unknown.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from roel_bench.registration_methods import METHODS, Answer, Query, Target, is_available
-from roel_bench.registration_places import LARGE, ROOM, SYMMETRIC, Place, part_of
+from roel_bench.registration_places import LARGE, MAP, ROOM, SYMMETRIC, Place, part_of
 from roel_bench.results import this_machine
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RegisterConfig
@@ -28,7 +29,9 @@ from roel_service.errors import InputError
 from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
 from roel_service.io.files import read_input, whole_file
 from roel_service.progress import Progress, ProgressCallback
-from roel_service.register.prepare import prepare_cloud
+from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map
+from roel_service.scene.clouds import PointCloud
+from roel_service.scene.lines import LineMap
 from roel_service.scene.results import RegistrationResult
 
 FORMAT = "roel registration benchmark 2"
@@ -37,6 +40,7 @@ MAX_BYTES = 64 << 20
 PAPER_SIGMA_RAD, PAPER_SIGMA_M = np.radians(10.0), 0.02
 WIDE_TURN_RAD, WIDE_SHIFT_M = np.radians(30.0), 0.3
 ANYWHERE_M = 3.0
+MAX_UNIT_RATIO = 5.0
 
 # Share of the cloud that `partial` leaves, cut off across its longer side.
 PARTIAL_SHARE = 0.7
@@ -52,7 +56,7 @@ class Trial:
     Attributes:
         place, kind, line_count, point_count, is_tuning: what was registered; points after thinning.
         protocol, method, seed: how.
-        rotation_deg, translation_mm: errors; of a place with a symmetry against the nearer of its
+        rotation_deg, translation_mm: errors, the unit's share in the shift included; of a place with a symmetry against the nearer of its
             two right answers, and None where the truth is not known.
         verdict: as told; empty where the method tells none.
         is_listed: whether all right answers are the answer or among its alternatives.
@@ -94,7 +98,7 @@ class Protocol:
 
 PROTOCOLS = (
     Protocol(name="paper", method="auto", count=50),
-    Protocol(name="paper", method="point", count=10),
+    Protocol(name="paper", method="point", count=50),
     Protocol(name="paper", method="plane", count=5),
     Protocol(name="paper", method="open3d plane", count=5),
     Protocol(name="paper", method="open3d gicp", count=3),
@@ -110,6 +114,10 @@ PROTOCOLS = (
     Protocol(name="free", method="open3d fpfh fgr", count=5),
     Protocol(name="elsewhere", method="global", count=2),
     Protocol(name="partial", method="auto", count=10),
+    Protocol(name="unit", method="global", count=5),
+    Protocol(name="wide", method="auto", count=10, kinds=(MAP,)),
+    Protocol(name="heading", method="global", count=10, kinds=(MAP,)),
+    Protocol(name="free", method="global", count=5, kinds=(MAP,)),
     Protocol(name="paper", method="auto", count=20, kinds=(LARGE,)),
     Protocol(name="paper", method="point", count=3, kinds=(LARGE,)),
     Protocol(name="heading", method="global", count=5, kinds=(LARGE,)),
@@ -153,7 +161,7 @@ STARTS: dict[str, Callable[[np.random.Generator], SE3]] = {
 
 
 class Clouds:
-    """Clouds prepared when they are first asked for, and the processor time it took."""
+    """Targets prepared when they are first asked for, and the processor time it took."""
 
     def __init__(self, places: Sequence[Place], config: RegisterConfig):
         self._places = {place.name: place for place in places}
@@ -161,14 +169,20 @@ class Clouds:
         self._known: dict[tuple[str, bool], tuple[Target, float]] = {}
 
     def of(self, name: str, *, is_partial: bool = False) -> tuple[Target, float]:
-        """The cloud of a place, or a part of it, and the seconds."""
+        """The target of a place, or a part of it, and the seconds."""
         if (name, is_partial) not in self._known:
-            cloud = self._places[name].cloud
-            cloud = part_of(cloud, PARTIAL_SHARE) if is_partial else cloud
+            target = self._places[name].target
+            if is_partial and isinstance(target, PointCloud):
+                target = part_of(target, PARTIAL_SHARE)
             began_s = time.process_time()
-            target = Target(cloud=prepare_cloud(cloud, self._config))
-            self._known[name, is_partial] = target, time.process_time() - began_s
+            prepared = Target(cloud=self._prepared(target))
+            self._known[name, is_partial] = prepared, time.process_time() - began_s
         return self._known[name, is_partial]
+
+    def _prepared(self, target: PointCloud | LineMap) -> PreparedCloud:
+        if isinstance(target, LineMap):
+            return prepare_map(target, self._config)
+        return prepare_cloud(target, self._config)
 
     def elsewhere(self, name: str, index: int) -> str | None:
         """The name of another room, if there are so many."""
@@ -241,16 +255,18 @@ def _trials(
             continue
         rng = np.random.default_rng(seed)
         name: str | None = place.name
-        T_moved, T_init = SE3.identity(), None
+        T_moved, T_init, unit = SE3.identity(), None, 1.0
         if protocol.name in STARTS:
             T_init = STARTS[protocol.name](rng)
         else:
             T_moved = anywhere(rng, upright=protocol.name != "free")
+        if protocol.name == "unit":
+            unit = float(np.exp(rng.uniform(-1.0, 1.0) * np.log(MAX_UNIT_RATIO)))
         if protocol.name == "elsewhere":
             name = clouds.elsewhere(place.name, seed)
         if name is not None:
             prepared = clouds.of(name, is_partial=protocol.name == "partial")
-            yield _trial(place, protocol, seed, prepared, T_moved, T_init)
+            yield _trial(place, protocol, seed, prepared, T_moved, T_init, unit)
 
 
 def _trial(
@@ -260,15 +276,17 @@ def _trial(
     prepared: tuple[Target, float],
     T_moved: SE3,
     T_init: SE3 | None,
+    unit: float,
 ) -> Trial:
-    """One registration of a map that was moved before."""
+    """One registration of a map that was moved before, and told in another unit."""
     target, prepare_s = prepared
-    query = Query(
-        line_map=place.line_map.transformed(T_moved),
-        target=target,
-        T_init=T_init,
-        config=dataclasses.replace(RegisterConfig(), gravity_aligned=protocol.name != "free"),
+    config = dataclasses.replace(
+        RegisterConfig(),
+        gravity_aligned=protocol.name != "free",
+        estimate_scale=protocol.name == "unit",
     )
+    line_map = scaled(place.line_map.transformed(T_moved), unit)
+    query = Query(line_map=line_map, target=target, T_init=T_init, config=config)
     began_s = time.process_time()
     answer = METHODS[protocol.method](query)
     seconds = time.process_time() - began_s
@@ -300,6 +318,13 @@ def errors(found: SE3, right: SE3) -> tuple[float, float]:
     off = found @ right.inverse()
     degrees = float(np.degrees(rotation_angle(off.rotation)))
     return degrees, 1e3 * float(np.linalg.norm(off.translation))
+
+
+def scaled(line_map: LineMap, unit: float) -> LineMap:
+    """A map with all lengths multiplied; itself with 1."""
+    if unit == 1.0:
+        return line_map
+    return replace(line_map, segments=unit * line_map.segments, sigma_m=unit * line_map.sigma_m)
 
 
 def is_found(degrees: float, millimetres: float) -> bool:

@@ -13,7 +13,7 @@ from roel_service.geometry.se3 import SE3
 from roel_service.scene.clouds import PointCloud, TriangleMesh
 from roel_service.scene.lines import LineMap
 
-ROOM, LARGE, SYMMETRIC = "room", "large", "symmetric"
+ROOM, LARGE, SYMMETRIC, MAP = "room", "large", "symmetric", "map"
 
 # Parameters were chosen by looking at these.
 TUNING_PLACES = ("room_11", "room_12", *(f"sim_{seed}" for seed in TUNING_SEEDS))
@@ -29,45 +29,62 @@ SYMMETRIC_POINT_COUNT, SYMMETRIC_NOISE_M = 150_000, 0.005
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Place:
-    """A map and the cloud of the same place, in one frame: the true transform is the identity.
+    """A map, and a cloud or another map of the same place, in one frame: the true transform is the identity.
 
     Attributes:
-        kind: `room`, `large` or `symmetric`.
+        kind: `room`, `large`, `symmetric`, or `map` where the target is a map.
         symmetry: a motion that leaves the place as it is, if there is one.
     """
 
     name: str
     line_map: LineMap
-    cloud: PointCloud
+    target: PointCloud | LineMap
     kind: str = ROOM
     is_tuning: bool = False
     symmetry: SE3 | None = None
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3) of the target, m: of the cloud, or the ends of the lines."""
+        if isinstance(self.target, LineMap):
+            return self.target.segments.reshape(-1, 3)
+        return self.target.points.astype(np.float64)
+
+
+def place_of(name: str, line_map: LineMap, target_name: str, target: PointCloud | LineMap) -> Place:
+    """A room by the names of its map and of what the map is laid over."""
+    is_tuning = name in TUNING_PLACES
+    if isinstance(target, PointCloud):
+        return Place(name=name, line_map=line_map, target=target, is_tuning=is_tuning)
+    name = f"{name} on {target_name}"
+    return Place(name=name, line_map=line_map, target=target, kind=MAP, is_tuning=is_tuning)
 
 
 def side_by_side(places: Sequence[Place]) -> Place:
     """Rooms in a row of rows as one large place, cut to the lines and points that times are asked for.
 
     Every room keeps its own map and its own cloud; nothing joins them but where they stand. Lines
-    beyond the count are left out room by room alike, and points by chance.
+    beyond the count are left out room by room alike, and points by chance. Maps on maps are passed over.
     """
+    places = [place for place in places if place.kind == ROOM]
     column_count = int(np.ceil(np.sqrt(len(places))))
-    extents = [np.ptp(place.cloud.points, axis=0) for place in places]
+    extents = [np.ptp(place.points, axis=0) for place in places]
     pitch_m = np.max(extents, axis=0) + LARGE_GAP_M
     maps, clouds = [], []
     for index, place in enumerate(places):
         row, column = divmod(index, column_count)
-        corner = place.cloud.points.min(axis=0).astype(np.float64)
+        corner = place.points.min(axis=0)
         shift = np.array([column, row, 0.0]) * pitch_m - corner
         T = SE3(rotation=np.eye(3), translation=shift)
         maps.append(place.line_map.transformed(T))
-        clouds.append(T @ place.cloud.points.astype(np.float64))
+        clouds.append(T @ place.points)
     rng = np.random.default_rng(0)
     points = np.concatenate(clouds)
     points = rng.permutation(points)[:LARGE_POINT_COUNT]
     return Place(
         name=f"{len(places)} rooms side by side",
         line_map=_joined(maps, LARGE_LINE_COUNT),
-        cloud=PointCloud(points=points),
+        target=PointCloud(points=points),
         kind=LARGE,
         is_tuning=any(place.is_tuning for place in places),
     )
@@ -116,7 +133,7 @@ def _symmetric_room(seed: int) -> Place:
         line_map=LineMap.from_segments(
             segments + rng.normal(0.0, SYMMETRIC_NOISE_M, segments.shape)
         ),
-        cloud=PointCloud(points=points + rng.normal(0.0, SYMMETRIC_NOISE_M, points.shape)),
+        target=PointCloud(points=points + rng.normal(0.0, SYMMETRIC_NOISE_M, points.shape)),
         kind=SYMMETRIC,
         symmetry=SE3(rotation=np.diag([-1.0, -1.0, 1.0]), translation=np.zeros(3)),
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from roel_bench.registration import FOUND_DEG, FOUND_MM, read_document
-from roel_bench.registration_places import LARGE, ROOM, SYMMETRIC
+from roel_bench.registration_places import LARGE, MAP, ROOM, SYMMETRIC
 from roel_bench.registration_scans import SCAN
 from roel_bench.results import machine_text
 from roel_bench.tables import table, write_text
@@ -72,6 +72,16 @@ right, above it the matrix promises too much. The lines of a map share the error
 so that their samples count as half an independent one for each line.
 """
 
+MAPS = """\
+Maps laid on other maps, line on line: those of a second recording of the same room by another trajectory, and
+the true edges of the room, as a drawing of a building has them.
+"""
+
+UNITS = """\
+Maps whose unit is unknown by a factor of up to 5 either way, searched for with any heading (`estimate_scale`).
+Shifts are metres of the cloud.
+"""
+
 SCANS = """\
 Point sets through the same core. small_gicp's pair has a reference transform; of PCL's rooms the heading is known
 (40.8 degrees); libpointmatcher's own tests allow 0.1 rad and 0.1 m for its car scans, and for its other clouds,
@@ -97,12 +107,15 @@ def document(results: dict[str, Any]) -> str:
     large = [trial for trial in trials if trial["kind"] == LARGE]
     symmetric = [trial for trial in trials if trial["kind"] == SYMMETRIC]
     scans = [trial for trial in trials if trial["kind"] == SCAN]
+    maps = [trial for trial in trials if trial["kind"] == MAP]
     blocks = [INTRODUCTION, PROTOCOLS, told]
     blocks += ["## From a first guess\n", _errors_table(rooms, ("paper", "wide", "partial"))]
     blocks += ["\n## From nothing\n", _errors_table(rooms, ("heading", "free"))]
     blocks += ["\n## Against others\n", PEERS, _peers_table(rooms)]
     blocks += ["\n## A large place\n", LARGE_TEXT, _errors_table(large), _large_ratio(large)]
-    blocks += ["\n## Verdicts\n", VERDICTS, _verdict_table([*rooms, *large])]
+    blocks += ["\n## A map on a map\n", MAPS, _errors_table(maps)]
+    blocks += ["\n## A map of unknown unit\n", UNITS, _errors_table(rooms, ("unit",))]
+    blocks += ["\n## Verdicts\n", VERDICTS, _verdict_table([*rooms, *large, *maps])]
     blocks += ["\n## Symmetric rooms\n", SYMMETRIC_TEXT, _symmetric_table(symmetric)]
     blocks += ["\n## What the information is worth\n", CALIBRATION, _nees_table(rooms)]
     blocks += ["\n## Real scans\n", SCANS, _scan_table(scans)]

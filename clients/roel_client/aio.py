@@ -389,6 +389,8 @@ class AsyncClient:
         *,
         T_init: SE3 | None = None,
         method: str = "auto",
+        up_source: FloatArray | None = None,
+        up_target: FloatArray | None = None,
         config: RegisterConfig | None = None,
         timeout_s: float = ANSWER_TIMEOUT_S,
     ) -> registration_pb2.RegisterResponse:
@@ -399,9 +401,18 @@ class AsyncClient:
             target: name of a version, an uploaded cloud, or (N, 3) points, m.
             T_init: first T_target_source; the identity by default.
             method: `auto`, `point`, `plane`, `line`, or `global`, which takes no first guess.
+            up_source, up_target: (3,) unit, which way is up on both sides, for `global`; z by default.
             config: parameters; those of the server by default.
         """
-        request = register_request(map_version, target, T_init=T_init, method=method, config=config)
+        request = register_request(
+            map_version,
+            target,
+            T_init=T_init,
+            method=method,
+            up_source=up_source,
+            up_target=up_target,
+            config=config,
+        )
         call = self._registration.Register
         return await self._connection.call(call, request, timeout_s=timeout_s)
 

@@ -266,6 +266,22 @@ def export_map(name: str, path: Path) -> None:
     maps.export_map(read_map_file(name).line_map, path)
 
 
+def import_map(name: str, path: Path) -> tuple[str, int, int]:
+    """Write lines of another program as a map file; their format, and lines kept and left out."""
+    from roel_service.errors import MapFileError
+    from roel_service.io.foreign_maps import read_foreign_map
+    from roel_service.wire.provenance import Provenance
+    from roel_service.wire.rlm import decode_map, encode_map
+
+    foreign_format, line_map = read_foreign_map(Path(name), name)
+    if len(line_map) == 0:
+        raise MapFileError(name, "lines", "none")
+    rlm_bytes = encode_map(line_map, Provenance())
+    path.write_bytes(rlm_bytes)
+    map_file = decode_map(rlm_bytes, subject=name)
+    return foreign_format, len(map_file.line_map), map_file.dropped_line_count
+
+
 def evaluate_map(name: str, mesh: str, edges: str) -> dict[str, Any]:
     """The figures of `roel evaluate map`; the map is a `.rlm` file or an exported NPZ."""
     from roel_service.evaluation import maps
@@ -400,7 +416,12 @@ def _registration_document(result: RegistrationResult, seconds: float) -> dict[s
         "information": None if information is None else information.tolist(),
         "weak_directions": result.weak_directions.tolist(),
         "alternatives": [
-            {"T_target_source": other.T_target_source.matrix().tolist(), "score": other.score}
+            {
+                "T_target_source": other.T_target_source.matrix().tolist(),
+                "scale": other.scale,
+                "fitness": other.fitness,
+                "score": other.score,
+            }
             for other in result.alternatives
         ],
         "iteration_count": result.iteration_count,
@@ -949,7 +970,7 @@ def bench_registration(
 
     Args:
         path: JSON file, which an interrupted run goes on with.
-        rooms: pairs of map and cloud.
+        rooms: pairs of map and cloud, or of two maps.
         has_large: whether all rooms side by side are a place as well.
         symmetric_count: rooms of boxes to make.
         scans: folder of real scans.
@@ -963,16 +984,12 @@ def bench_registration(
         registration_report,
         registration_scans,
     )
-    from roel_service.io.clouds import read_cloud
 
     places = [
-        registration_places.Place(
-            name=Path(map_name).stem,
-            line_map=_read_map(map_name),
-            cloud=read_cloud(Path(cloud_name)),
-            is_tuning=Path(map_name).stem in registration_places.TUNING_PLACES,
+        registration_places.place_of(
+            Path(map_name).stem, _read_map(map_name), Path(target).stem, _read_target(target)
         )
-        for map_name, cloud_name in rooms
+        for map_name, target in rooms
     ]
     if has_large:
         places.append(registration_places.side_by_side(places))

@@ -58,6 +58,8 @@ def read_foreign_map(path: Path, subject: str) -> tuple[str, LineMap]:
         return name, _READERS[name](path, subject)
     except _DAMAGE as damage:
         found = str(damage) or type(damage).__name__
+        if isinstance(damage, KeyError):
+            found = f"no {damage.args[0]}"
         raise MapFileError(subject, f"lines in the format {name}", found) from damage
 
 
@@ -140,7 +142,8 @@ def _read_obj(path: Path, subject: str) -> LineMap:
                     vertices.append((float(x), float(y), float(z)))
                 case [b"l", *corners]:
                     ends += pairwise(_obj_index(corner, len(vertices)) for corner in corners)
-    return LineMap.from_segments(np.array(vertices).reshape(-1, 3)[np.reshape(ends, (-1, 2))])
+    rows = np.array(ends, np.int64).reshape(-1, 2)
+    return LineMap.from_segments(np.array(vertices).reshape(-1, 3)[rows])
 
 
 def _obj_index(corner: bytes, vertex_count: int) -> int:

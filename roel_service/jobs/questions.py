@@ -19,6 +19,7 @@ from roel_service.errors import ConfigError, CorruptionError, InputError, LimitE
 from roel_service.geometry.se3 import SE3
 from roel_service.jobs.inputs import CachePlace
 from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
+from roel_service.register.vertical import Vertical
 from roel_service.scene.camera import Camera
 from roel_service.scene.lines import LineMap
 from roel_service.store.maps import Maps
@@ -79,6 +80,7 @@ class RegisterQuestion:
     Attributes:
         target: another map, an uploaded cloud, or float32 points (N, 3), m, as bytes.
         T_init: first T_target_source; None: the identity.
+        vertical: which way is up; None: as the parameters say.
         cache: where prepared targets are kept.
     """
 
@@ -86,6 +88,7 @@ class RegisterQuestion:
     target: MapFile | StoredFile | bytes
     T_init: SE3 | None
     method: str
+    vertical: Vertical | None
     config: RegisterConfig
     cache: CachePlace | None
 
@@ -175,13 +178,13 @@ class Questions:
             LimitError: too many points.
             NotFoundError, StateError: a version or blob that is not there, or not usable.
         """
-        _refuse_gravity(request)
         method = _method(request)
         return RegisterQuestion(
             source=self._map_file(request.map_version),
             target=self._target(request),
             T_init=transform_from_proto(request.init, "init") if request.HasField("init") else None,
             method=method,
+            vertical=_vertical(request),
             config=_register_config(request),
             cache=self._cache,
         )
@@ -313,13 +316,16 @@ def _camera(request: localization_pb2.LocalizeRequest) -> Camera | None:
     return camera_from_proto(request.camera)
 
 
+def _vertical(request: registration_pb2.RegisterRequest) -> Vertical | None:
+    ups = _ups(request, "up_source", "up_target")
+    return None if ups is None else Vertical(up_source=ups[0], up_target=ups[1])
+
+
 def _gravity(request: localization_pb2.LocalizeRequest) -> Gravity | None:
-    given = [name for name in ("up_world", "up_panorama") if request.HasField(name)]
-    if not given:
+    ups = _ups(request, "up_world", "up_panorama")
+    if ups is None:
         return None
-    if len(given) == 1:
-        raise InputError("up_world", "up_world and up_panorama together", f"{given[0]} alone")
-    up_world, up_picture = (_direction(getattr(request, name), name) for name in given)
+    up_world, up_picture = ups
     if not 0.0 <= request.up_sigma_deg <= MAX_UP_SIGMA_DEG:
         expected = f"0 to {MAX_UP_SIGMA_DEG:.0f} degrees"
         raise InputError("up_sigma_deg", expected, f"{request.up_sigma_deg}")
@@ -327,6 +333,18 @@ def _gravity(request: localization_pb2.LocalizeRequest) -> Gravity | None:
         return Gravity(up_world=up_world, up_picture=up_picture)
     sigma_rad = math.radians(request.up_sigma_deg)
     return Gravity(up_world=up_world, up_picture=up_picture, sigma_rad=sigma_rad)
+
+
+def _ups(
+    request: registration_pb2.RegisterRequest | localization_pb2.LocalizeRequest, *names: str
+) -> list[FloatArray] | None:
+    """Directions against gravity, all of them or none."""
+    given = [name for name in names if request.HasField(name)]
+    if not given:
+        return None
+    if len(given) < len(names):
+        raise InputError(names[0], f"{' and '.join(names)} together", f"{given[0]} alone")
+    return [_direction(getattr(request, name), name) for name in names]
 
 
 def _direction(message: types_pb2.Vector3, name: str) -> FloatArray:
@@ -344,10 +362,3 @@ def _hypothesis_count(request: localization_pb2.LocalizeRequest, config: Localiz
         expected = f"0 to {MAX_HYPOTHESIS_COUNT}"
         raise InputError("max_hypothesis_count", expected, f"{request.max_hypothesis_count}")
     return request.max_hypothesis_count or config.max_hypothesis_count
-
-
-def _refuse_gravity(request: registration_pb2.RegisterRequest) -> None:
-    for name in ("up_source", "up_target"):
-        if request.HasField(name):
-            expected = "none: z is vertical on both sides unless config.gravity_aligned is false"
-            raise InputError(name, expected, "a direction")

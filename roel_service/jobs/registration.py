@@ -34,7 +34,12 @@ def answer(
     prepared_s = time.perf_counter()
     with naming({"map": question.source.name}):
         result = register_map(
-            source, target, question.config, method=question.method, T_init=question.T_init
+            source,
+            target,
+            question.config,
+            method=question.method,
+            T_init=question.T_init,
+            vertical=question.vertical,
         )
     message = registration_to_proto(result)
     message.map_version = question.source.name

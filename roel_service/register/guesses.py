@@ -17,6 +17,7 @@ from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
 from roel_service.register.directions import is_new, matching_rotations
 from roel_service.register.prepare import VOTING_CELLS, PreparedCloud
 from roel_service.register.source import Samples, Source
+from roel_service.register.vertical import Vertical
 from roel_service.register.voting import VotingGrid, sharpened, vote, voting_grid
 
 # Samples that vote.
@@ -25,8 +26,6 @@ VOTER_COUNT = 1500
 SHIFT_COUNT = 3
 # Guesses with fewer votes than this share of the best one's are not followed up.
 VOTE_RATIO = 0.5
-# With a vertical that both sides share, a rotation this far off it is none.
-MAX_TILT_RAD = np.radians(8.0)
 # Turns about the first guess where nothing else is known.
 BLIND_TURN_RAD = np.radians(18.0)
 # Headings all around where nothing is known at all.
@@ -57,14 +56,16 @@ def guesses_near(
     return [*_voted(source, target, rotations, config, T_init), first]
 
 
-def guesses_anywhere(source: Source, target: PreparedCloud, config: RegisterConfig) -> list[Guess]:
-    """Guesses from nothing, best first."""
+def guesses_anywhere(
+    source: Source, target: PreparedCloud, config: RegisterConfig, vertical: Vertical | None
+) -> list[Guess]:
+    """Guesses from nothing, best first; of any rotation if there is no vertical."""
     rotations = matching_rotations(source.axes, target.axes)
-    if config.gravity_aligned:
-        rotations = _headings(rotations)
+    if vertical is not None:
+        rotations = _upright(rotations, vertical)
     if len(rotations) == 0:
         angles = np.arange(BLIND_HEADING_COUNT) * (2.0 * np.pi / BLIND_HEADING_COUNT)
-        rotations = rotation_from_vector(angles[:, None] * [0.0, 0.0, 1.0])
+        rotations = (vertical or Vertical()).turned(angles)
     found = _voted(source, target, rotations, config, None)
     return found or [Guess(T_target_source=SE3.identity(), scale=1.0, votes=0.0)]
 
@@ -75,14 +76,10 @@ def _turned(rotation: FloatArray) -> FloatArray:
     return np.asarray(rotation_from_vector(BLIND_TURN_RAD * axes) @ rotation)
 
 
-def _headings(rotations: FloatArray) -> FloatArray:
-    """(R, 3, 3) those of the rotations that keep z up, as rotations about z alone."""
-    upright = rotations[rotations[:, 2, 2] > np.cos(MAX_TILT_RAD)]
+def _upright(rotations: FloatArray, vertical: Vertical) -> FloatArray:
+    """(R, 3, 3) those of the rotations that lay up on up, made to do so exactly."""
     found: list[FloatArray] = []
-    for angle in np.arctan2(
-        upright[:, 1, 0] - upright[:, 0, 1], upright[:, 0, 0] + upright[:, 1, 1]
-    ):
-        rotation = rotation_from_vector(np.array([0.0, 0.0, angle]))
+    for rotation in vertical.turned(vertical.headings_rad(rotations)):
         if is_new(rotation, found):
             found.append(rotation)
     return np.array(found).reshape(-1, 3, 3)

@@ -17,7 +17,8 @@ from roel_service.register.guesses import Guess, guesses_anywhere, guesses_near
 from roel_service.register.point_to_point import align_points
 from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map, require_points
 from roel_service.register.source import Source, require_lines, source_of_cloud, source_of_map
-from roel_service.register.verdict import Rival, agreement, judge
+from roel_service.register.verdict import competing, judge
+from roel_service.register.vertical import Vertical
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import RegistrationResult, StopReason
@@ -48,6 +49,7 @@ def register_map(
     *,
     method: str = "auto",
     T_init: SE3 | None = None,
+    vertical: Vertical | None = None,
 ) -> RegistrationResult:
     """Where a line map lies in a cloud, or in another map.
 
@@ -57,6 +59,7 @@ def register_map(
         config: parameters.
         method: one of `METHODS`.
         T_init: first T_target_source; the identity by default, and not looked at by `global`.
+        vertical: which way is up, for `global`; None: along z if `config.gravity_aligned`, else unknown.
 
     Raises:
         NoAnswerError: fewer than three lines.
@@ -72,13 +75,15 @@ def register_map(
         require_same_unit(moving, target.points)
     T_init = T_init or SE3.identity()
     if method == "point":
-        return judge(_by_points(source, moving, target, T_init, config), [], moving, target, config)
+        ended = _by_points(source, moving, target, T_init, config)
+        return judge([ended], moving, target, config)
     if method in PULLS:
-        return judge(
-            _from_start(method, moving, target, T_init, config), [], moving, target, config
-        )
+        ended = _from_start(method, moving, target, T_init, config)
+        return judge([ended], moving, target, config)
     if method == "global":
-        guesses = guesses_anywhere(moving, target, config)
+        if vertical is None and config.gravity_aligned:
+            vertical = Vertical()
+        guesses = guesses_anywhere(moving, target, config, vertical)
     else:
         guesses = guesses_near(moving, target, T_init, config)
     return _best(guesses, moving, target, config)
@@ -105,7 +110,7 @@ def _prepared(target: PointCloud | LineMap, config: RegisterConfig) -> PreparedC
 def _best(
     guesses: list[Guess], source: Source, target: PreparedCloud, config: RegisterConfig
 ) -> RegistrationResult:
-    """Follow up all guesses a little, and the best one to its end."""
+    """Follow up all guesses a little, and those that compete with the best one to their ends."""
     first_scale, last_scale = (scale * target.resolution_m for scale in FOLLOW_UP_SCALES)
     follow_up = Level(
         first_scale_m=first_scale,
@@ -114,16 +119,19 @@ def _best(
         step_count=FOLLOW_UP_STEP_COUNT,
         estimate_scale=config.estimate_scale,
     )
-    rivals = []
-    for guess in guesses:
-        ended = align(source.samples, target, _start(guess), follow_up)
-        score = agreement(ended, source, target, FOLLOW_UP_JUDGED_COUNT).score
-        rivals.append(Rival(alignment=ended, score=score))
-    best = max(rivals, key=lambda rival: rival.score)
-    alignment = best.alignment
+    followed = [align(source.samples, target, _start(guess), follow_up) for guess in guesses]
+    rivals = competing(followed, source, target, config, FOLLOW_UP_JUDGED_COUNT)
+    settled = [_settled(rival.alignment, source, target, config) for rival in rivals]
+    return judge(settled, source, target, config)
+
+
+def _settled(
+    alignment: Alignment, source: Source, target: PreparedCloud, config: RegisterConfig
+) -> Alignment:
+    """Down to the last scale, where the follow-up ended."""
     for level in _last_levels(config, target.resolution_m):
         alignment = align(source.samples, target, alignment, level)
-    return judge(alignment, rivals, source, target, config)
+    return alignment
 
 
 def _from_start(

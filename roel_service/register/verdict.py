@@ -44,9 +44,7 @@ class Agreement:
         return (self.surface + CREASE_WEIGHT * self.crease) / (1.0 + CREASE_WEIGHT)
 
 
-def agreement(
-    alignment: Alignment, source: Source, target: PreparedCloud, count: int = JUDGED_COUNT
-) -> Agreement:
+def agreement(alignment: Alignment, source: Source, target: PreparedCloud, count: int) -> Agreement:
     """How well the source, moved, agrees with the target."""
     samples, votes = source.samples.at_most(count), source.votes.at_most(count)
     reach_m = SURFACE_REACH * target.resolution_m
@@ -83,31 +81,51 @@ def is_same(a: SE3, b: SE3, centre: FloatArray) -> bool:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Rival:
-    """Where another guess ended, and its agreement's score."""
+    """Where one guess ended, and how well it agrees there."""
 
     alignment: Alignment
-    score: float
+    found: Agreement
 
 
-def judge(
-    alignment: Alignment,
-    rivals: list[Rival],
+def competing(
+    alignments: list[Alignment],
     source: Source,
     target: PreparedCloud,
     config: RegisterConfig,
+    count: int = JUDGED_COUNT,
+) -> list[Rival]:
+    """Those that agree about as well as the best, best first, each place once.
+
+    Args:
+        count: about so many samples are looked at.
+    """
+    rivals = [
+        Rival(alignment=one, found=agreement(one, source, target, count)) for one in alignments
+    ]
+    rivals.sort(key=lambda rival: -rival.found.score)
+    kept: list[Rival] = []
+    for rival in rivals:
+        if rival.found.score < config.ambiguity_ratio * rivals[0].found.score:
+            break
+        T = rival.alignment.T_target_source
+        if not any(is_same(T, one.alignment.T_target_source, source.centre) for one in kept):
+            kept.append(rival)
+    return kept
+
+
+def judge(
+    alignments: list[Alignment], source: Source, target: PreparedCloud, config: RegisterConfig
 ) -> RegistrationResult:
     """The result of a method, with what it is worth.
 
     Args:
-        alignment: the transform.
-        rivals: where other guesses ended, in any order.
+        alignments: where its guesses ended, in any order; at least one.
     """
-    samples = source.samples
+    best, *others = competing(alignments, source, target, config)
+    alignment, samples = best.alignment, source.samples
     moved = _moved(alignment, samples)
-    distance_m, _ = target.tree.query(moved, distance_upper_bound=config.max_distance_m)
+    distance_m = _distances_m(moved, target, config)
     near = np.isfinite(distance_m)
-    found = agreement(alignment, source, target)
-    alternatives = _alternatives(alignment, rivals, found.score, source, config)
     held, weak = None, np.empty((0, 6))
     if near.any():
         held = information(alignment, samples, target)
@@ -118,15 +136,32 @@ def judge(
         T_target_source=alignment.T_target_source,
         scale=alignment.scale,
         stop_reason=alignment.stop_reason if near.any() else StopReason.NO_OVERLAP,
-        verdict=_verdict(fitness, found, bool(alternatives) or len(weak) > 0, config),
+        verdict=_verdict(fitness, best.found, bool(others) or len(weak) > 0, config),
         fitness=fitness,
         overlap=overlap(moved, target),
-        agreement=found.score,
+        agreement=best.found.score,
         inlier_rmse_m=float(np.sqrt((distance_m[near] ** 2).mean())) if near.any() else None,
         information=held,
         weak_directions=weak,
-        alternatives=tuple(alternatives),
+        alternatives=tuple(_alternative(rival, samples, target, config) for rival in others),
         iteration_count=alignment.iteration_count,
+    )
+
+
+def _distances_m(moved: FloatArray, target: PreparedCloud, config: RegisterConfig) -> FloatArray:
+    """(P,) to the nearest points of the target; infinite beyond the largest that fits."""
+    return np.asarray(target.tree.query(moved, distance_upper_bound=config.max_distance_m)[0])
+
+
+def _alternative(
+    rival: Rival, samples: Samples, target: PreparedCloud, config: RegisterConfig
+) -> Alternative:
+    distance_m = _distances_m(_moved(rival.alignment, samples), target, config)
+    return Alternative(
+        T_target_source=rival.alignment.T_target_source,
+        scale=rival.alignment.scale,
+        fitness=float(np.isfinite(distance_m).mean()),
+        score=rival.found.score,
     )
 
 
@@ -155,26 +190,6 @@ def _verdict(
     if fitness < config.min_fitness or found.score < config.min_agreement:
         return Verdict.REJECTED
     return Verdict.AMBIGUOUS if is_contested else Verdict.ACCEPTED
-
-
-def _alternatives(
-    alignment: Alignment,
-    rivals: list[Rival],
-    score: float,
-    source: Source,
-    config: RegisterConfig,
-) -> list[Alternative]:
-    """Other transforms that agree about as well, best first, each once."""
-    kept = [alignment.T_target_source]
-    found = []
-    for rival in sorted(rivals, key=lambda rival: -rival.score):
-        T = rival.alignment.T_target_source
-        if rival.score < config.ambiguity_ratio * score:
-            break
-        if not any(is_same(T, other, source.centre) for other in kept):
-            kept.append(T)
-            found.append(Alternative(T_target_source=T, score=rival.score))
-    return found
 
 
 def _radius_m(points: FloatArray) -> float:

@@ -88,9 +88,16 @@ class StopReason(Enum):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Alternative:
-    """Another transform that fits, and how well it does."""
+    """Another transform that fits about as well.
+
+    Attributes:
+        T_target_source, scale, fitness: as those of the answer.
+        score: as the answer's agreement.
+    """
 
     T_target_source: SE3
+    scale: float
+    fitness: float
     score: float
 
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from roel_service.arrays import Array
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import InputError
 from roel_service.geometry.se3 import SE3
@@ -18,6 +18,7 @@ from roel_service.wire.nouns import (
     matrix6_to_proto,
     transform_from_proto,
     transform_to_proto,
+    vector_to_proto,
 )
 
 # By their numbers in the protocol; what is not said is the first one.
@@ -38,6 +39,8 @@ def register_request(
     *,
     T_init: SE3 | None = None,
     method: str = "auto",
+    up_source: FloatArray | None = None,
+    up_target: FloatArray | None = None,
     config: RegisterConfig | None = None,
 ) -> registration_pb2.RegisterRequest:
     """What to ask; arguments as of `AsyncClient.register`."""
@@ -54,6 +57,10 @@ def register_request(
         request.points.points_m = np.ascontiguousarray(target, "<f4").tobytes()
     if T_init is not None:
         request.init.CopyFrom(transform_to_proto(T_init, *_FRAMES))
+    if up_source is not None:
+        request.up_source.CopyFrom(vector_to_proto(up_source))
+    if up_target is not None:
+        request.up_target.CopyFrom(vector_to_proto(up_target))
     if config is not None:
         tables = {"register": dataclasses.asdict(config)}
         request.config.CopyFrom(tables_to_proto(tables).register)
@@ -79,6 +86,8 @@ def registration_to_proto(result: RegistrationResult) -> registration_pb2.Regist
         alternatives=[
             registration_pb2.RegistrationAlternative(
                 T_target_source=transform_to_proto(other.T_target_source, *_FRAMES),
+                scale=other.scale,
+                fitness=other.fitness,
                 score=other.score,
             )
             for other in result.alternatives
@@ -111,6 +120,8 @@ def registration_from_proto(message: registration_pb2.RegisterResponse) -> Regis
         alternatives=tuple(
             Alternative(
                 T_target_source=transform_from_proto(other.T_target_source, "T_target_source"),
+                scale=other.scale,
+                fitness=other.fitness,
                 score=other.score,
             )
             for other in message.alternatives

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from roel_bench import registration, registration_report
 from roel_bench.registration import PROTOCOLS, keep, read_document, run, write_document
 from roel_bench.registration_methods import METHODS, Query, Target, is_available
-from roel_bench.registration_places import Place, part_of, side_by_side, symmetric_rooms
+from roel_bench.registration_places import MAP, Place, part_of, side_by_side, symmetric_rooms
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import InputError
 from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
@@ -24,13 +24,16 @@ def results():
         Place(
             name=name,
             line_map=room_map(boxes),
-            cloud=room_cloud(boxes, count=30_000),
+            target=room_cloud(boxes, count=30_000),
             is_tuning=name == "room_11",
         )
         for name, boxes in (("room_11", (ROOM, *FURNITURE)), ("bare", (ROOM, *FURNITURE[:2])))
     ]
     places.append(dataclasses.replace(side_by_side(places), line_map=places[0].line_map))
-    places[2] = dataclasses.replace(places[2], cloud=places[0].cloud)  # small, for speed
+    places[2] = dataclasses.replace(places[2], target=places[0].target)  # small, for speed
+    places.append(
+        Place(name="a map on another", line_map=room_map(), target=room_map(seed=5), kind=MAP)
+    )
     one_each = [
         dataclasses.replace(p, count=1)
         for p in PROTOCOLS
@@ -43,9 +46,10 @@ def test_every_protocol_runs_on_every_place(results):
     kinds = {(trial["place"], trial["protocol"]) for trial in results["trials"]}
     own = {p.name for p in PROTOCOLS if p.kinds == ("room",)}
     large = {p.name for p in PROTOCOLS if p.kinds == ("large",)}
+    maps = {p.name for p in PROTOCOLS if p.kinds == ("map",)}
     assert kinds == {(n, p) for n in ("room_11", "bare") for p in own} | {
         ("2 rooms side by side", p) for p in large
-    }
+    } | {("a map on another", p) for p in maps}
     for trial in results["trials"]:
         if trial["protocol"] != "elsewhere":
             assert not registration_report.is_wrong(trial), trial
@@ -63,7 +67,7 @@ def test_what_a_file_holds_is_not_run_again(tmp_path, results):
     path = tmp_path / "r.json"
     trial = registration.Trial(**results["trials"][0])
     keep([dataclasses.replace(trial, seconds=99.0)], path)
-    place = Place(name=trial.place, line_map=room_map(), cloud=room_cloud(count=200))
+    place = Place(name=trial.place, line_map=room_map(), target=room_cloud(count=200))
     protocol = next(p for p in PROTOCOLS if (p.name, p.method) == (trial.protocol, trial.method))
     again = run([place], [dataclasses.replace(protocol, count=1)], ignore, path=path)
     assert [known["seconds"] for known in again["trials"]] == [99.0]
@@ -103,14 +107,14 @@ def test_every_method_comes_home_from_a_close_start(target, method, bound_deg, b
 
 def test_rooms_side_by_side_keep_their_maps_on_their_clouds():
     places = [
-        Place(name=f"{i}", line_map=room_map(), cloud=room_cloud(count=5_000)) for i in range(3)
+        Place(name=f"{i}", line_map=room_map(), target=room_cloud(count=5_000)) for i in range(3)
     ]
     large = side_by_side(places)
     assert len(large.line_map) == 3 * len(room_map())
-    assert len(large.cloud) == 15_000
-    distance_m, _ = cKDTree(large.cloud.points).query(large.line_map.segments.reshape(-1, 3))
+    assert len(large.target) == 15_000
+    distance_m, _ = cKDTree(large.target.points).query(large.line_map.segments.reshape(-1, 3))
     assert np.median(distance_m) < 0.1  # 5,000 points leave gaps
-    assert (np.ptp(large.cloud.points, axis=0)[:2] > 1.9 * np.array([4.0, 3.2])).all()
+    assert (np.ptp(large.target.points, axis=0)[:2] > 1.9 * np.array([4.0, 3.2])).all()
 
 
 def test_a_part_of_a_cloud_ends_at_a_plane():
@@ -122,8 +126,8 @@ def test_a_part_of_a_cloud_ends_at_a_plane():
 
 def test_symmetric_rooms_are_left_alike_by_half_a_turn():
     (place,) = symmetric_rooms(1)
-    turned = place.symmetry @ place.cloud.points[:2000].astype(np.float64)
-    distance_m, _ = cKDTree(place.cloud.points).query(turned)
+    turned = place.symmetry @ place.target.points[:2000].astype(np.float64)
+    distance_m, _ = cKDTree(place.target.points).query(turned)
     assert np.quantile(distance_m, 0.95) < 0.05
 
 

@@ -134,10 +134,10 @@ def leaf_commands() -> list[tuple[str, ...]]:
 
 
 def test_all_commands_of_the_contract_exist() -> None:
-    expected = {"map build", "map info", "map export", "evaluate map", "config show"}
+    expected = {"map build", "map info", "map import", "map export", "evaluate map"}
     expected |= {"serve", "simulate", "demo", "health", "bench mapping", "register"}
     expected |= {"refine-poses", "track", "localize", "bench registration", "bench localization"}
-    expected |= {"bench poses", "batch localize"}
+    expected |= {"bench poses", "batch localize", "config show"}
     expected |= {"admin fsck", "admin backup", "admin gc"}
     expected |= {"admin token create", "admin token list", "admin token revoke"}
     assert {" ".join(words) for words in leaf_commands()} == expected

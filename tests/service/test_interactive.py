@@ -36,6 +36,7 @@ from roel_service.pano_loc.localize import localize_panorama, localize_photograp
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.progress import ignore
 from roel_service.register.register import register_map
+from roel_service.register.vertical import Vertical
 from roel_service.scene.clouds import PointCloud
 from roel_service.scene.results import LocalizationStatus
 from roel_service.store.builds import BuiltVersion
@@ -291,6 +292,17 @@ class TestRegister:
         assert answer.verdict == registration_pb2.RegisterResponse.VERDICT_ACCEPTED
         assert (np.diff(answer.eigenvalues) >= 0.0).all()
 
+    def test_the_verticals_of_both_sides_guide_a_search(self, client, version, cloud, line_map):
+        up, down = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+        answer = client.register(
+            version, cloud, method="global", up_source=up, up_target=down, config=COARSE
+        )
+        points = PointCloud(points=room_cloud(count=4000).points)
+        vertical = Vertical(up_source=up, up_target=down)
+        expected = register_map(line_map, points, COARSE, method="global", vertical=vertical)
+        assert_equal(answer, expected)
+        assert expected.T_target_source.rotation[2, 2] < -0.9
+
     def test_points_in_the_request_are_as_good_as_a_file(self, client, version, cloud):
         points = room_cloud(count=4000).points
         answers = [client.register(version, target, config=COARSE) for target in (points, cloud)]
@@ -328,7 +340,16 @@ class TestRegister:
             ({"method": 17}, InputError, "method: expected one of auto, point"),
             ({"method": 5, "init": types_pb2.Transform()}, InputError, "init: expected no first"),
             ({"init": types_pb2.Transform()}, InputError, "init: expected 9 numbers"),
-            ({"up_source": types_pb2.Vector3(z=1.0)}, InputError, "up_source: expected none"),
+            (
+                {"up_source": types_pb2.Vector3(z=1.0)},
+                InputError,
+                "up_source and up_target together",
+            ),
+            (
+                {"up_source": types_pb2.Vector3(z=2.0), "up_target": types_pb2.Vector3(z=1.0)},
+                InputError,
+                "up_source: expected a unit vector",
+            ),
             ({"preset": "best"}, ConfigError, "expected one of default"),
             ({"points": types_pb2.Points(points_m=b"123")}, InputError, "points: expected rows"),
             ({"points": types_pb2.Points(points_m=bytes(5001 * 12))}, LimitError, "at most 5000"),
@@ -343,7 +364,7 @@ class TestRegister:
     def test_requests_that_cannot_be_answered_are_refused(
         self, call, version, fields, error, message
     ):
-        target = {} if fields.keys() <= {"up_source"} else {"points": types_pb2.Points()}
+        target = {} if not fields else {"points": types_pb2.Points()}
         with pytest.raises(error, match=message):
             call(version, **{**target, **fields})
 

@@ -90,8 +90,8 @@ def _add_registration(group: Subparsers) -> None:
         action="append",
         nargs=2,
         default=[],
-        metavar=("MAP", "CLOUD"),
-        help="a map and the cloud of the same place in the same frame; may be repeated",
+        metavar=("MAP", "TARGET"),
+        help="a map and the cloud, or another map, of the same place in the same frame; may be repeated",
     )
     parser.add_argument(
         "--large",

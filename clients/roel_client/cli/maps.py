@@ -1,4 +1,4 @@
-"""`roel map build`, `roel map info`, `roel map export`."""
+"""`roel map build`, `roel map info`, `roel map import`, `roel map export`."""
 
 from __future__ import annotations
 
@@ -37,6 +37,7 @@ def add_commands(subparsers: Subparsers) -> None:
     group = command_group(subparsers, "map", "build, look at and convert line maps")
     _add_build(group)
     _add_info(group)
+    _add_import(group)
     _add_export(group)
 
 
@@ -156,6 +157,26 @@ def _shown(value: Any) -> str:
     if isinstance(value, list):
         return " ".join(_shown(item) for item in value)
     return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _add_import(group: Subparsers) -> None:
+    what = Command(run=import_map, inputs=("lines",), outputs=("out",))
+    parser = command(group, "import", "make a map of lines from another program", what)
+    parser.add_argument(
+        "lines",
+        metavar="LINES",
+        help="NPZ, JSON, CSV, OBJ, PLY, DXF, or LIMAP's tracks (text or ZIP)",
+    )
+    parser.add_argument("--out", required=True, type=suffixed(".rlm"), metavar="MAP.rlm")
+
+
+def import_map(options: argparse.Namespace, staged: Staged) -> None:
+    """Write lines of another program as a map file."""
+    from roel_client import local
+
+    name, kept_count, dropped_count = local.import_map(options.lines, staged["out"])
+    dropped = f", {dropped_count} without length left out" if dropped_count else ""
+    print_result({}, f"{options.out}: {kept_count} lines from {name}{dropped}", as_json=False)
 
 
 def _add_export(group: Subparsers) -> None:
