@@ -64,8 +64,8 @@ def guesses_anywhere(
     if vertical is not None:
         rotations = _upright(rotations, vertical)
     if len(rotations) == 0:
-        angles = np.arange(BLIND_HEADING_COUNT) * (2.0 * np.pi / BLIND_HEADING_COUNT)
-        rotations = (vertical or Vertical()).turned(angles)
+        angles = np.linspace(0.0, 2.0 * np.pi, BLIND_HEADING_COUNT, endpoint=False)
+        rotations = (vertical or Vertical()).turned(np.asarray(angles))
     found = _voted(source, target, rotations, config, None)
     return found or [Guess(T_target_source=SE3.identity(), scale=1.0, votes=0.0)]
 
