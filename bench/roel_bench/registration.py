@@ -3,7 +3,7 @@
 The paper's protocol turns the start about yaw, pitch and roll one after the other, 10 degrees standard
 deviation each, and then shifts it by 2 cm; `wide` is any start up to 30 degrees and 0.3 m off; `heading`
 and `free` move the whole map anywhere, and ask for it without a first guess; `elsewhere` asks for it in
-the cloud of another place, and `partial` in 70 % of its own cloud. `unit` is `heading` for a map whose unit
+the cloud of another place, `partial` and `half` in 70 % and half of its own cloud. `unit` is `heading` for a map whose unit
 is unknown.
 """
 
@@ -42,8 +42,8 @@ WIDE_TURN_RAD, WIDE_SHIFT_M = np.radians(30.0), 0.3
 ANYWHERE_M = 3.0
 MAX_UNIT_RATIO = 5.0
 
-# Share of the cloud that `partial` leaves, cut off across its longer side.
-PARTIAL_SHARE = 0.7
+# Protocols in which no answer is right.
+ELSEWHERE = ("elsewhere", "elsewhere half")
 
 # What counts as found by a search from nothing.
 FOUND_DEG, FOUND_MM = 5.0, 100.0
@@ -88,12 +88,17 @@ class Trial:
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """A way to begin: how many starts of which method, on which kinds of places."""
+    """A way to begin: how many starts of which method, on which kinds of places.
+
+    Attributes:
+        share: of the cloud that is left, cut off across its longer side.
+    """
 
     name: str
     method: str
     count: int
     kinds: tuple[str, ...] = (ROOM,)
+    share: float = 1.0
 
 
 PROTOCOLS = (
@@ -113,7 +118,9 @@ PROTOCOLS = (
     Protocol(name="free", method="open3d fpfh ransac", count=5),
     Protocol(name="free", method="open3d fpfh fgr", count=5),
     Protocol(name="elsewhere", method="global", count=2),
-    Protocol(name="partial", method="auto", count=10),
+    Protocol(name="elsewhere half", method="global", count=2, share=0.5),
+    Protocol(name="partial", method="auto", count=10, share=0.7),
+    Protocol(name="half", method="auto", count=10, share=0.5),
     Protocol(name="unit", method="global", count=5),
     Protocol(name="wide", method="auto", count=10, kinds=(MAP,)),
     Protocol(name="heading", method="global", count=10, kinds=(MAP,)),
@@ -157,6 +164,7 @@ STARTS: dict[str, Callable[[np.random.Generator], SE3]] = {
     "paper": paper_start,
     "wide": wide_start,
     "partial": wide_start,
+    "half": wide_start,
 }
 
 
@@ -166,18 +174,18 @@ class Clouds:
     def __init__(self, places: Sequence[Place], config: RegisterConfig):
         self._places = {place.name: place for place in places}
         self._config = config
-        self._known: dict[tuple[str, bool], tuple[Target, float]] = {}
+        self._known: dict[tuple[str, float], tuple[Target, float]] = {}
 
-    def of(self, name: str, *, is_partial: bool = False) -> tuple[Target, float]:
-        """The target of a place, or a part of it, and the seconds."""
-        if (name, is_partial) not in self._known:
+    def of(self, name: str, share: float) -> tuple[Target, float]:
+        """The target of a place, or a share of it, and the seconds."""
+        if (name, share) not in self._known:
             target = self._places[name].target
-            if is_partial and isinstance(target, PointCloud):
-                target = part_of(target, PARTIAL_SHARE)
+            if share < 1.0 and isinstance(target, PointCloud):
+                target = part_of(target, share)
             began_s = time.process_time()
             prepared = Target(cloud=self._prepared(target))
-            self._known[name, is_partial] = prepared, time.process_time() - began_s
-        return self._known[name, is_partial]
+            self._known[name, share] = prepared, time.process_time() - began_s
+        return self._known[name, share]
 
     def _prepared(self, target: PointCloud | LineMap) -> PreparedCloud:
         if isinstance(target, LineMap):
@@ -262,10 +270,10 @@ def _trials(
             T_moved = anywhere(rng, upright=protocol.name != "free")
         if protocol.name == "unit":
             unit = float(np.exp(rng.uniform(-1.0, 1.0) * np.log(MAX_UNIT_RATIO)))
-        if protocol.name == "elsewhere":
+        if protocol.name in ELSEWHERE:
             name = clouds.elsewhere(place.name, seed)
         if name is not None:
-            prepared = clouds.of(name, is_partial=protocol.name == "partial")
+            prepared = clouds.of(name, protocol.share)
             yield _trial(place, protocol, seed, prepared, T_moved, T_init, unit)
 
 

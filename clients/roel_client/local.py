@@ -409,6 +409,7 @@ def _registration_document(result: RegistrationResult, seconds: float) -> dict[s
         "converged": result.converged,
         "stop_reason": result.stop_reason.value,
         "verdict": result.verdict.value,
+        "inside": result.inside,
         "fitness": result.fitness,
         "overlap": result.overlap,
         "agreement": result.agreement,

@@ -424,8 +424,9 @@ class RegisterConfig(Stage, table="register"):
         last_scale_m: error beyond which a sample hardly counts in the end.
         step_count: at most so many steps of the last level.
         candidate_count: guesses that are followed up, the best first.
-        min_fitness: a smaller share of fitting samples is no registration.
-        min_agreement: nor is one whose lines agree less with surfaces and creases.
+        min_inside: a smaller share of the map inside the cloud's box is no registration.
+        min_fitness: nor is a smaller share of fitting samples; more is asked where little is inside.
+        min_agreement: nor is one whose lines agree less, inside, with surfaces and creases.
         ambiguity_ratio: another transform that agrees at least so well against the best is a rival.
         sample_spacing_m: spacing of the points along lines of method `point`.
         point_gate_m: pairs of method `point` farther apart than this do not count.
@@ -441,8 +442,9 @@ class RegisterConfig(Stage, table="register"):
     last_scale_m: float = parameter(0.01, POSITIVE)
     step_count: int = parameter(20, UP_TO_1000)
     candidate_count: int = parameter(8, at_most(1000))
+    min_inside: float = parameter(0.3, SHARE)
     min_fitness: float = parameter(0.6, SHARE)
-    min_agreement: float = parameter(0.35, SHARE)
+    min_agreement: float = parameter(0.42, SHARE)
     ambiguity_ratio: float = parameter(0.85, SHARE)
     sample_spacing_m: float = parameter(0.005, POSITIVE)
     point_gate_m: float = parameter(0.5, POSITIVE)

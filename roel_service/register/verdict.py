@@ -131,12 +131,14 @@ def judge(
         held = information(alignment, samples, target)
         arm = moved.mean(axis=0) - alignment.T_target_source.translation
         weak = weak_directions(held, arm, _radius_m(moved))
-    fitness = float(near.mean())
+    fitness, inside = float(near.mean()), inside_share(moved, target, config.max_distance_m)
+    is_contested = bool(others) or len(weak) > 0
     return RegistrationResult(
         T_target_source=alignment.T_target_source,
         scale=alignment.scale,
         stop_reason=alignment.stop_reason if near.any() else StopReason.NO_OVERLAP,
-        verdict=_verdict(fitness, best.found, bool(others) or len(weak) > 0, config),
+        verdict=_verdict(inside, fitness, best.found.score, is_contested, config),
+        inside=inside,
         fitness=fitness,
         overlap=overlap(moved, target),
         agreement=best.found.score,
@@ -184,10 +186,24 @@ def overlap(moved: FloatArray, target: PreparedCloud) -> float:
     return float(np.isfinite(distance_m).mean())
 
 
+def inside_share(moved: FloatArray, target: PreparedCloud, reach_m: float) -> float:
+    """Share of (P, 3) moved samples inside the target's box, or near it."""
+    low, high = target.points.min(axis=0) - reach_m, target.points.max(axis=0) + reach_m
+    return float(((moved >= low) & (moved <= high)).all(axis=1).mean())
+
+
 def _verdict(
-    fitness: float, found: Agreement, is_contested: bool, config: RegisterConfig
+    inside: float, fitness: float, score: float, is_contested: bool, config: RegisterConfig
 ) -> Verdict:
-    if fitness < config.min_fitness or found.score < config.min_agreement:
+    """What a transform is worth by its shares of all samples.
+
+    A cloud says nothing of what lies outside its box, where nothing fits and nothing agrees. The less is
+    inside, the easier it fits somewhere, so that fewer of those samples may be misfits.
+    """
+    if inside < config.min_inside:
+        return Verdict.REJECTED
+    max_misfit = (1.0 - config.min_fitness) * inside**2
+    if fitness < (1.0 - max_misfit) * inside or score < config.min_agreement * inside:
         return Verdict.REJECTED
     return Verdict.AMBIGUOUS if is_contested else Verdict.ACCEPTED
 

@@ -110,6 +110,7 @@ class RegistrationResult:
         scale: 1 unless it was asked for.
         stop_reason: why the iterations ended.
         verdict: whether the transform may be relied on.
+        inside: share of the source's samples inside the target's box, 0 to 1.
         fitness: share of the source's samples with something of the target near by, 0 to 1.
         overlap: share of the target's creases inside the source's box that a sample is near, 0 to 1.
         agreement: share of the samples on surfaces and on creases that run their way, 0 to 1.
@@ -125,6 +126,7 @@ class RegistrationResult:
     scale: float = 1.0
     stop_reason: StopReason
     verdict: Verdict
+    inside: float
     fitness: float
     overlap: float
     agreement: float

@@ -147,6 +147,19 @@ def test_a_map_of_another_room_is_rejected(prepared):
     assert result.verdict is Verdict.REJECTED
 
 
+@pytest.mark.parametrize(("share", "verdict"), [(0.5, Verdict.ACCEPTED), (0.2, Verdict.REJECTED)])
+def test_a_cloud_judges_the_part_of_the_map_inside_it(share, verdict):
+    cloud = room_cloud()
+    end_m = np.quantile(cloud.points[:, 0], share)
+    part = PointCloud(points=cloud.points[cloud.points[:, 0] <= end_m])
+    result = register_map(room_map(), part, CONFIG, T_init=NUDGE)
+    assert result.verdict is verdict
+    assert result.inside < share + 0.1
+    assert result.fitness <= result.inside
+    if verdict is Verdict.ACCEPTED:
+        assert max(errors(result.T_target_source)) < 10.0
+
+
 def test_one_plane_leaves_three_directions_open():
     rng = np.random.default_rng(0)
     floor = np.c_[rng.uniform(0.0, 4.0, (20_000, 2)), rng.normal(0.0, 0.003, 20_000)]
