@@ -38,6 +38,7 @@ from roel_service.store.records import (
     VersionState,
     now_us,
     row_from_record,
+    stored,
 )
 from roel_service.store.retention import DAY_US, OPERATION_RETENTION_DAYS
 from roel_service.store.schema import MAP, MAP_VERSION, OPERATION
@@ -102,9 +103,9 @@ def map_row(index: int) -> dict[str, Any]:
         delete_time_us=0,
         purge_time_us=0,
     )
-    row = row_from_record(record)
+    row = record._asdict()
     del row["aliases"]
-    return row
+    return stored(row)
 
 
 def ended_operation(name: str) -> OperationRecord:

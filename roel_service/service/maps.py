@@ -18,7 +18,7 @@ from roel_service.service.labels import checked_display_name, checked_labels, up
 from roel_service.service.line_streams import conditions_from_proto, line_messages
 from roel_service.service.operations import submitted
 from roel_service.service.paging import page_of, page_request
-from roel_service.service.records import map_to_proto, map_version_to_proto
+from roel_service.service.records import map_to_proto, map_version_to_proto, write_map
 from roel_service.service.requests import content_sha256, request_id
 from roel_service.service.settings import Settings
 from roel_service.store.builds import ImportedBlob
@@ -67,10 +67,10 @@ class MapServicer:
         wanted = page_request(scope, request.page_size, request.page_token)
         fetch = partial(self._store.maps.page, show_deleted=request.show_deleted)
         page = await asyncio.to_thread(page_of, wanted, fetch, lambda item: item.id)
-        return maps_pb2.ListMapsResponse(
-            maps=[map_to_proto(item) for item in page.items],
-            next_page_token=page.next_page_token,
-        )
+        response = maps_pb2.ListMapsResponse(next_page_token=page.next_page_token)
+        for item in page.items:
+            write_map(response.maps.add(), item)
+        return response
 
     async def UpdateMap(self, request: maps_pb2.UpdateMapRequest, context: Any) -> maps_pb2.Map:
         map_id = names.map_id(request.map.name)

@@ -71,24 +71,30 @@ def event_stream_to_proto(record: EventStreamRecord) -> events_pb2.EventStream:
 
 def map_to_proto(record: MapRecord) -> maps_pb2.Map:
     """A map."""
-    message = maps_pb2.Map(
-        name=names.map_name(record.id),
-        uid=record.uid,
-        version_count=record.version_count,
-        display_name=record.display_name,
-        etag=record.etag,
-        create_time=_timestamp(record.create_time_us),
-        update_time=_timestamp(record.update_time_us),
-    )
-    # Entry by entry: as arguments the two maps would take more time than all the rest.
+    message = maps_pb2.Map()
+    write_map(message, record)
+    return message
+
+
+def write_map(message: maps_pb2.Map, record: MapRecord) -> None:
+    """Make an empty message a map.
+
+    Field by field: messages made to be copied into another take twice as long.
+    """
+    message.name = names.map_name(record.id)
+    message.uid = record.uid
+    message.version_count = record.version_count
+    message.display_name = record.display_name
+    message.etag = record.etag
+    _write_time(message.create_time, record.create_time_us)
+    _write_time(message.update_time, record.update_time_us)
     for key, value in record.labels.items():
         message.labels[key] = value
     for alias, version in record.aliases.items():
         message.aliases[alias] = f"v{version}"
     if record.is_deleted:
-        message.delete_time.CopyFrom(_timestamp(record.delete_time_us))
-        message.purge_time.CopyFrom(_timestamp(record.purge_time_us))
-    return message
+        _write_time(message.delete_time, record.delete_time_us)
+        _write_time(message.purge_time, record.purge_time_us)
 
 
 def map_version_to_proto(record: MapVersionRecord) -> maps_pb2.MapVersion:
@@ -218,5 +224,12 @@ _TARGETS: dict[OperationMethod, Callable[[OperationRecord], str]] = {
 
 
 def _timestamp(time_us: int) -> Timestamp:
+    message = Timestamp()
+    _write_time(message, time_us)
+    return message
+
+
+def _write_time(message: Timestamp, time_us: int) -> None:
     seconds, us = divmod(time_us, 1_000_000)
-    return Timestamp(seconds=seconds, nanos=1000 * us)
+    message.seconds = seconds
+    message.nanos = 1000 * us

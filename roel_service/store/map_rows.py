@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import Connection, Select, delete, exists, func, insert, select, update
+from sqlalchemy import (
+    Connection,
+    Select,
+    bindparam,
+    delete,
+    exists,
+    func,
+    insert,
+    select,
+    update,
+)
 
 from roel_service.errors import ConflictError, NotFoundError, StateError
 from roel_service.store.etags import check_etag
@@ -20,13 +29,29 @@ from roel_service.store.records import (
     VersionState,
     map_version_from_row,
     now_us,
-    row_from_record,
     stored,
 )
 from roel_service.store.schema import MAP, MAP_ALIAS, MAP_VERSION, OPERATION
 
 # The alias that nobody sets: the newest usable version.
 LATEST = "latest"
+
+_NEWEST = select(func.max(MAP_VERSION.c.version)).where(
+    MAP_VERSION.c.map_id == MAP.c.id,
+    MAP_VERSION.c.state.in_([state.value for state in USABLE]),
+)
+_ALIASES = select(func.json_group_object(MAP_ALIAS.c.alias, MAP_ALIAS.c.version)).where(
+    MAP_ALIAS.c.map_id == MAP.c.id
+)
+
+# Maps as `map_records` reads them: the columns that a record has as they are come first.
+MAPS = select(
+    *(MAP.c[name] for name in MapRecord._fields if name not in ("labels", "aliases")),
+    _NEWEST.scalar_subquery().label("newest"),
+    MAP.c.labels,
+    _ALIASES.scalar_subquery().label("aliases"),
+)
+_ONE_MAP = MAPS.where(MAP.c.id == bindparam("map_id"))
 
 
 def get_map(connection: Connection, map_id: str) -> MapRecord:
@@ -40,41 +65,28 @@ def get_map(connection: Connection, map_id: str) -> MapRecord:
 
 def find_map(connection: Connection, map_id: str) -> MapRecord:
     """One map, also a deleted one; raises `NotFoundError`."""
-    records = map_records(connection, select(MAP).where(MAP.c.id == map_id))
+    records = map_records(connection, _ONE_MAP, {"map_id": map_id})
     if not records:
         raise NotFoundError("map", "an existing one", map_id)
     return records[0]
 
 
-def map_records(connection: Connection, query: Select[Any]) -> list[MapRecord]:
-    """The maps of a query for whole rows in the order of ids, with their aliases."""
-    # By position: a mapping for each row would take as long as all the rest.
-    names = MAP.c.keys()
-    rows = [dict(zip(names, row, strict=True)) for row in connection.execute(query).all()]
-    if not rows:
-        return []
-    aliases = _aliases_between(connection, rows[0]["id"], rows[-1]["id"])
-    for row in rows:
-        row["labels"] = json.loads(row["labels"])
-        row["aliases"] = aliases.get(row["id"], {})
-    return [MapRecord(**row) for row in rows]
+def map_records(
+    connection: Connection, query: Select[Any], arguments: dict[str, Any]
+) -> list[MapRecord]:
+    """The maps that a query of `MAPS` finds."""
+    rows = connection.execute(query, arguments).all()
+    # All texts at once: one by one they would take as long as all the rest.
+    texts = ",".join(text for row in rows for text in (row.labels, row.aliases))
+    parsed = iter(json.loads(f"[{texts}]"))
+    return [
+        MapRecord._make((*columns, next(parsed), _with_latest(next(parsed), newest)))
+        for *columns, newest, _, _ in rows
+    ]
 
 
-def _aliases_between(connection: Connection, first: str, last: str) -> dict[str, dict[str, int]]:
-    """Aliases of every map whose id lies between two, with the newest usable version."""
-    chosen = select(MAP_ALIAS.c.map_id, MAP_ALIAS.c.alias, MAP_ALIAS.c.version)
-    newest = select(MAP_VERSION.c.map_id, func.max(MAP_VERSION.c.version)).where(
-        MAP_VERSION.c.map_id.between(first, last),
-        MAP_VERSION.c.state.in_([state.value for state in USABLE]),
-    )
-    aliases: dict[str, dict[str, int]] = defaultdict(dict)
-    for map_id, alias, version in connection.execute(
-        chosen.where(MAP_ALIAS.c.map_id.between(first, last)).order_by(MAP_ALIAS.c.alias)
-    ):
-        aliases[map_id][alias] = version
-    for map_id, version in connection.execute(newest.group_by(MAP_VERSION.c.map_id)):
-        aliases[map_id][LATEST] = version
-    return aliases
+def _with_latest(aliases: dict[str, int], newest: int | None) -> dict[str, int]:
+    return aliases if newest is None else {**aliases, LATEST: newest}
 
 
 def get_version(connection: Connection, record: MapRecord, label: int | str) -> MapVersionRecord:
@@ -94,9 +106,9 @@ def insert_map(connection: Connection, record: MapRecord) -> MapRecord:
     """A new map; raises `ConflictError` ALREADY_EXISTS."""
     if connection.execute(select(exists().where(MAP.c.id == record.id))).scalar_one():
         raise ConflictError("map", "an id not in use", record.id, reason="ALREADY_EXISTS")
-    row = row_from_record(record)
+    row = record._asdict()
     del row["aliases"]
-    connection.execute(insert(MAP), row)
+    connection.execute(insert(MAP), stored(row))
     return record
 
 
@@ -104,7 +116,7 @@ def change_map(connection: Connection, record: MapRecord, values: dict[str, Any]
     """Change fields on a caller's behalf: the map gets a new etag."""
     changes = {**values, "revision": record.revision + 1, "update_time_us": now_us()}
     connection.execute(update(MAP).where(MAP.c.id == record.id).values(stored(changes)))
-    return dataclasses.replace(record, **changes)
+    return record._replace(**changes)
 
 
 def forget_map(connection: Connection, map_id: str) -> None:

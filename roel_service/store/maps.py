@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import uuid
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, delete, select
+from sqlalchemy import Connection, bindparam, delete, select
 
 from roel_service.errors import LimitError, NotFoundError, StateError
 from roel_service.store.blobs import BlobStore
@@ -18,6 +17,7 @@ from roel_service.store.database import Database
 from roel_service.store.etags import check_etag
 from roel_service.store.map_rows import (
     LATEST,
+    MAPS,
     change_map,
     change_version,
     check_state,
@@ -46,9 +46,10 @@ from roel_service.store.retention import DAY_US, DELETED_MAP_RETENTION_DAYS
 from roel_service.store.schema import MAP, MAP_VERSION
 
 _MAP_MEMORY: Memory[MapRecord] = Memory(
-    lambda record: json.dumps(dataclasses.asdict(record)),
+    lambda record: json.dumps(record._asdict()),
     lambda text: MapRecord(**json.loads(text)),
 )
+_PAGE = MAPS.where(MAP.c.id > bindparam("after_id")).order_by(MAP.c.id).limit(bindparam("limit"))
 _VERSION_MEMORY = row_memory(map_version_from_row)
 
 
@@ -95,11 +96,9 @@ class Maps:
 
     def page(self, after_id: str, limit: int, *, show_deleted: bool = False) -> list[MapRecord]:
         """Maps with an id above `after_id`, in the order of ids."""
-        query = select(MAP).where(MAP.c.id > after_id).order_by(MAP.c.id).limit(limit)
-        if not show_deleted:
-            query = query.where(MAP.c.delete_time_us == 0)
+        query = _PAGE if show_deleted else _PAGE.where(MAP.c.delete_time_us == 0)
         with self._database.read() as connection:
-            return map_records(connection, query)
+            return map_records(connection, query, {"after_id": after_id, "limit": limit})
 
     def update(
         self, map_id: str, values: dict[str, Any], etag: str, request: RequestId | None
