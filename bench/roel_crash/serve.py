@@ -21,6 +21,9 @@ def main() -> None:
         # Between a file and the row that names it lie milliseconds here: sweeps have work to do.
         sweep_interval_s=0.5,
         longest_upload_s=10.0,
+        # A checker that was left without a server for long gives up its upload. The build that
+        # follows it would keep one of the two children from everybody else for ten minutes.
+        follow_patience_s=5.0,
     )
 
     def announce(addresses: Addresses) -> None:

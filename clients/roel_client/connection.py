@@ -17,8 +17,8 @@ import grpc
 from google.rpc import status_pb2
 
 from roel_client.retry import Attempts, RetryPolicy, identified, is_repeatable
-from roel_service.errors import Cancelled, RoelError
-from roel_service.wire.errors import error_from_status
+from roel_service.errors import Cancelled, LimitError, RoelError
+from roel_service.wire.errors import error_from_status, status_from_error
 
 Result = TypeVar("Result")
 
@@ -102,6 +102,12 @@ class Endpoint:
     def _translated(self, error: Any) -> RoelError | Cancelled:
         # In asyncio the failure itself has the details, otherwise the call has, which is the failure.
         status = _status_with_details(error)
+        if status is None and error.code() is grpc.StatusCode.CANCELLED:
+            # Not by us, or it would not be an error: gRPC drops what a busy server has not looked at.
+            expected, found = "room for one more call", "a call that was dropped unread"
+            status = status_from_error(
+                LimitError(self.address, expected, found, reason="QUEUE_FULL")
+            )
         if status is None:
             status = status_pb2.Status(code=error.code().value[0], message=error.details())
         return error_from_status(status, subject=self.address)

@@ -230,6 +230,10 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_connection_age_ms", CONNECTION_AGE_MS),
         ("grpc.max_connection_age_grace_ms", CONNECTION_AGE_GRACE_MS),
         ("grpc.compression_enabled_algorithms_bitset", IDENTITY_ONLY),
+        # What arrives faster than the event loop takes it is dropped before it costs anything: some
+        # beyond the first number, all beyond the second.
+        ("grpc.server.max_pending_requests", settings.calls_unseen),
+        ("grpc.server.max_pending_requests_hard_limit", 2 * settings.calls_unseen),
         # Otherwise a second server shares the port and takes half of the calls.
         ("grpc.so_reuseport", 0),
     ]

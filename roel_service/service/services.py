@@ -77,6 +77,28 @@ _DESCRIPTORS = {
 SERVICES = tuple(descriptor.full_name for descriptor in _DESCRIPTORS.values())
 
 
+# Whoever wants to end or watch an operation is heard however many calls of other kinds there are.
+_OWN_QUEUES = ("OperationService", "Operations")
+
+
+class _Shared:
+    """A server whose handlers share one queue of calls that nobody has looked at yet.
+
+    A registered method has a queue of its own in gRPC, and for every call that comes asyncio looks at
+    all of these queues: with those of every method, a third of what a lookup costs.
+    """
+
+    def __init__(self, server: Any) -> None:
+        self._server = server
+
+    def add_generic_rpc_handlers(self, handlers: Any) -> None:
+        """Handlers by the names of their methods."""
+        self._server.add_generic_rpc_handlers(handlers)
+
+    def add_registered_method_handlers(self, service: str, handlers: Any) -> None:
+        """Left out."""
+
+
 def add_services(
     server: Any,
     store: Store,
@@ -127,4 +149,7 @@ def add_services(
     answered[_DESCRIPTORS["CapabilitiesService"]] = capabilities
     for descriptor, servicer in answered.items():
         _, add = _DECLARED[descriptor.name]
-        add(complete(descriptor, servicer), server)
+        add(
+            complete(descriptor, servicer),
+            server if descriptor.name in _OWN_QUEUES else _Shared(server),
+        )

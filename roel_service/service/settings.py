@@ -48,6 +48,8 @@ class Settings:
         alias_count: most aliases of a map.
         calls_in_flight: calls of one method at a time.
         calls_waiting: calls of one method that may wait for their turn.
+        calls_unseen: calls that may have arrived without having been looked at; beyond, gRPC drops
+            them.
         interactive_workers: children that answer callers who wait; all methods share them.
         interactive_queued: such questions that may wait for a child.
         interactive_time_s: how long an answer may take.
@@ -93,6 +95,7 @@ class Settings:
     alias_count: int = 64
     calls_in_flight: int = 32
     calls_waiting: int = 128
+    calls_unseen: int = 128
     interactive_workers: int = 2
     interactive_queued: int = 8
     interactive_time_s: float = 120.0

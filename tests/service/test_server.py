@@ -14,15 +14,16 @@ from grpc_reflection.v1alpha.proto_reflection_descriptor_database import (
     ProtoReflectionDescriptorDatabase,
 )
 
-from roel_client import Client
+from roel_client import AsyncClient, Client
 from roel_client.connection import Connection, Endpoint
+from roel_client.retry import NO_RETRY
 from roel_service import __version__
-from roel_service.errors import InputError, RoelError, UnavailableError
+from roel_service.errors import InputError, LimitError, RoelError, UnavailableError
 from roel_service.scene.results import MAPPING_STAGES
 from roel_service.service.listen import Listen
 from roel_service.service.server import serve
 from roel_service.service.services import SERVICES
-from roel_service.v1 import events_pb2, events_pb2_grpc
+from roel_service.v1 import events_pb2, events_pb2_grpc, maps_pb2
 from roel_service.wire.chunks import encode_chunk, split_chunks
 
 from .processes import CAMERA, config_of, events_of, new_id, ready_recording, wait_until
@@ -107,6 +108,28 @@ def test_the_module_announces_its_address_and_ends_with_0(folder):
             assert client.capabilities().version == __version__
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0
+
+
+def test_calls_that_come_too_fast_are_dropped_unread_but_not_health_checks(start_server):
+    server = start_server(calls_unseen=1)
+
+    async def main():
+        async with (
+            AsyncClient(server.address, retry=NO_RETRY) as client,
+            grpc.aio.insecure_channel(server.address) as channel,
+        ):
+            name = await client.create_map("house")
+            calls = asyncio.gather(*(client.map(name) for _ in range(300)), return_exceptions=True)
+            check = health_pb2_grpc.HealthStub(channel).Check
+            for _ in range(10):
+                await check(health_pb2.HealthCheckRequest(), timeout=30)
+            return await calls
+
+    answers = asyncio.run(main())
+    dropped = [answer for answer in answers if isinstance(answer, LimitError)]
+    assert 0 < len(dropped) < len(answers)
+    assert {(error.reason, error.retry_after_s) for error in dropped} == {("QUEUE_FULL", 5.0)}
+    assert all(isinstance(answer, maps_pb2.Map | LimitError) for answer in answers)
 
 
 def test_a_folder_serves_one_server(server):
