@@ -360,6 +360,8 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
             a round of matching and refinement.
         pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
         pose_interval_us: control points of the poses' correction are so far apart.
+        pose_loss_scale_px: residual at which the Cauchy loss of lines and poses starts to bend, at the
+            last gate.
         pose_noise_px: noise of an observation as a whole, against the drift of the poses.
         pose_drift_deg, pose_drift_m: how far the given poses are expected to wander off, standard
             deviations; how far they did is learned from there.
@@ -368,10 +370,11 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
 
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     free_poses: bool = False
-    pose_gates_px: tuple[float, ...] = parameter((3.0, 2.5, 2.0, 1.5, 1.3), SOME_POSITIVE)
+    pose_gates_px: tuple[float, ...] = parameter((3.0, 2.0, 1.3), SOME_POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)
     pose_interval_us: int = parameter(100_000, POSITIVE)
-    pose_noise_px: float = parameter(0.35, POSITIVE)
+    pose_loss_scale_px: float = parameter(0.15, POSITIVE)
+    pose_noise_px: float = parameter(0.15, POSITIVE)
     pose_drift_deg: float = parameter(0.25, POSITIVE)
     pose_drift_m: float = parameter(0.005, POSITIVE)
     pose_drift_s: float = parameter(1.5, POSITIVE)

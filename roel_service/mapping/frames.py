@@ -13,7 +13,7 @@ import numpy as np
 
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import DetectConfig, FramesConfig
-from roel_service.geometry.se3 import SE3
+from roel_service.geometry.se3 import SE3, vector_from_rotation
 from roel_service.mapping import frames_kernels
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSlice, EventStream, concatenate
@@ -73,11 +73,25 @@ class EventFrame:
 
 def velocities(frames: Frames, trajectory: Trajectory) -> FloatArray:
     """(N, 3) camera velocity at each frame, m/s, world."""
+    before, after, step_s = _around(frames, trajectory)
+    return (after.translation - before.translation) / step_s
+
+
+def turn_rates(frames: Frames, trajectory: Trajectory) -> FloatArray:
+    """(N, 3) angular velocity of the camera at each frame, rad/s, in its own frame."""
+    before, after, step_s = _around(frames, trajectory)
+    turn = np.swapaxes(before.rotation, -1, -2) @ after.rotation
+    return np.asarray(vector_from_rotation(turn) / step_s)
+
+
+def _around(frames: Frames, trajectory: Trajectory) -> tuple[SE3, SE3, FloatArray]:
+    """(N) poses just before and just after each frame, and the (N, 1) seconds between them."""
     limits = trajectory.t_us[[0, -1]]
-    before = np.clip(frames.t_us - VELOCITY_HALF_STEP_US, *limits)
-    after = np.clip(frames.t_us + VELOCITY_HALF_STEP_US, *limits)
-    moved = trajectory.interpolate(after).translation - trajectory.interpolate(before).translation
-    return moved / ((after - before) * 1e-6)[:, None]
+    before_us = np.clip(frames.t_us - VELOCITY_HALF_STEP_US, *limits)
+    after_us = np.clip(frames.t_us + VELOCITY_HALF_STEP_US, *limits)
+    before, after = trajectory.interpolate(before_us), trajectory.interpolate(after_us)
+    step_s = np.asarray((after_us - before_us) * 1e-6, dtype=np.float64)
+    return before, after, step_s[:, None]
 
 
 def frame_times(

@@ -18,6 +18,7 @@ from roel_service.geometry import plucker, projection, segments
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
+from roel_service.mapping.contrast import sides_of_lines, with_one_side
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames, velocities
@@ -50,6 +51,7 @@ def reassociate(
     trajectory: Trajectory,
     config: Config,
     progress: StepCallback,
+    bright_side: IntArray | None = None,
 ) -> Refined:
     """Let lines collect their observations from all frames, in rounds.
 
@@ -63,6 +65,8 @@ def reassociate(
         config: `match_global` and, for between the rounds, `refine_rounds`. Speeds can be predicted where
             `frames` undoes the camera's rotation.
         progress: called once a round; may raise `Cancelled`.
+        bright_side: (M,) of the observations; lines then keep to those that see the side that most
+            of theirs see. See `contrast`.
     """
     settings = config.match_global
     velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
@@ -72,6 +76,10 @@ def reassociate(
         found = _associate(
             refined, evidence.views, observations, frames, velocity, max_distance_px, settings
         )
+        if bright_side is not None:
+            views = evidence.views
+            own = sides_of_lines(refined.tracks, refined.lines, views, bright_side)
+            found = with_one_side(found, refined.lines, views, bright_side, own)
         refined = _held(refined, found, evidence, frames, config.refine_rounds)
         refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
         exclusive = _exclusive(refined, evidence.views, frames)

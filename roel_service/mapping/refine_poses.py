@@ -19,6 +19,7 @@ from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_points, align_poses
 from roel_service.geometry.se3 import SE3
+from roel_service.mapping.contrast import bright_sides
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
@@ -52,7 +53,7 @@ MIN_LINE_COUNT = 6
 # and that of the poses need not be quite the same.
 MAP_GATES = (4.0, 2.0)
 # While the gate is wide, residuals up to this share of it count in full.
-FULL_WEIGHT_SHARE = 1.0 / 3.0
+FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
 LEAST_OFFSET_US, OFFSET_SIGMA_COUNT = 4_000.0, 4.0
 MAX_OFFSET_COUNT = 3
@@ -272,6 +273,12 @@ def _with_own_lines(
 ) -> tuple[Refined, list[JointlyRefined]]:
     """Rounds of matching with the poses as they are, and of refining lines and poses together."""
     refined = _first_lines(detected, config, run)
+    bright_side = bright_sides(
+        detected.observations,
+        detected.frames,
+        smooth,
+        rotation_is_undone=config.frames.compensate_rotation,
+    )
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
     for gate_px in config.refine.pose_gates_px:
@@ -280,7 +287,14 @@ def _with_own_lines(
             frames, evidence = _seen_with(detected, correction)
             poses = correction.trajectory(smooth)
             refined = reassociate(
-                refined, evidence, detected.observations, frames, poses, gated, run.step
+                refined,
+                evidence,
+                detected.observations,
+                frames,
+                poses,
+                gated,
+                run.step,
+                bright_side,
             )
         _check_count(refined)
         with run.stage("refine"):
@@ -337,19 +351,18 @@ def _check_count(refined: Refined) -> None:
 
 def _with_gate(config: Config, gate_px: float) -> Config:
     """Matching and refinement within a distance, never closer than with known poses."""
+    scale_px = max(config.refine.pose_loss_scale_px, FULL_WEIGHT_SHARE * gate_px)
     return replace(
         config,
         match_global=replace(config.match_global, max_distances_px=(gate_px,)),
-        refine_rounds=_widened(config.refine_rounds, gate_px),
-        refine=_widened(config.refine, gate_px),
+        refine_rounds=_gated(config.refine_rounds, gate_px, scale_px),
+        refine=_gated(config.refine, gate_px, scale_px),
     )
 
 
-def _widened(costs: Costs, gate_px: float) -> Costs:
+def _gated(costs: Costs, gate_px: float, scale_px: float) -> Costs:
     return replace(
-        costs,
-        max_residual_px=max(costs.max_residual_px, gate_px),
-        loss_scale_px=max(costs.loss_scale_px, FULL_WEIGHT_SHARE * gate_px),
+        costs, max_residual_px=max(costs.max_residual_px, gate_px), loss_scale_px=scale_px
     )
 
 
