@@ -19,6 +19,8 @@ from roel_service.geometry.vectors import dot, norm
 MAX_FLATNESS = 0.15
 # and if it is not much thicker than the median one.
 MAX_THICKNESS_RATIO = 1.6
+# ... and one below this is none, in cells.
+MIN_THICKNESS_CELLS = 1e-3
 # Patches this near, this alike and this little out of each other's plane are of one plane.
 LIKE_CELLS, MIN_LIKE_COSINE, MAX_LIKE_OFFSET_CELLS = 3.0, 0.97, 0.25
 WINDOW_STRIDE_CELLS = 1.2
@@ -72,7 +74,10 @@ def fit_patches(points: FloatArray, cell_m: float) -> Patches:
     enough = values[:, 0] < MAX_FLATNESS * values[:, 1]
     if not enough.any():
         return Patches(centres=np.empty((0, 3)), normals=np.empty((0, 3)))
-    flat = enough & (values[:, 0] < (MAX_THICKNESS_RATIO**2) * np.median(values[enough, 0]))
+    thickness_m = np.sqrt(np.maximum(values[:, 0], 0.0))
+    max_m = MAX_THICKNESS_RATIO * np.median(thickness_m[enough])
+    # Computed surfaces have no thickness but that of rounding.
+    flat = enough & (thickness_m < max(max_m, MIN_THICKNESS_CELLS * cell_m))
     # Neighbouring windows share most of their points: the fullest one of each cell is enough.
     flat = np.flatnonzero(flat)
     flat = flat[np.argsort(-moments[flat, 0], kind="stable")]

@@ -10,7 +10,7 @@ from roel_service.geometry.segments import sample_segments
 from roel_service.register.align import Level, align
 from roel_service.register.alignment import Alignment
 from roel_service.register.prepare import prepare_cloud
-from roel_service.register.register import register_map
+from roel_service.register.register import METHODS, register_map
 from roel_service.register.source import Samples, source_of_map
 from roel_service.register.verdict import overlap
 from roel_service.register.vertical import Vertical
@@ -160,9 +160,23 @@ def test_a_cloud_judges_the_part_of_the_map_inside_it(share, verdict):
         assert max(errors(result.T_target_source)) < 10.0
 
 
-def test_one_plane_leaves_three_directions_open():
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    "directions",
+    [np.eye(3)[:1], np.eye(3)[:2], np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])],
+    ids=["a line", "a floor", "a wall"],
+)
+def test_clouds_without_extent_in_some_direction_are_never_accepted(method, directions):
     rng = np.random.default_rng(0)
-    floor = np.c_[rng.uniform(0.0, 4.0, (20_000, 2)), rng.normal(0.0, 0.003, 20_000)]
+    cloud = PointCloud(points=rng.uniform(0.0, 4.0, (3000, len(directions))) @ directions)
+    result = register_map(room_map(), cloud, CONFIG, method=method)
+    assert result.verdict is not Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("noise_m", [0.003, 0.0])
+def test_one_plane_leaves_three_directions_open(noise_m):
+    rng = np.random.default_rng(0)
+    floor = np.c_[rng.uniform(0.0, 4.0, (20_000, 2)), rng.normal(0.0, noise_m, 20_000)]
     lines = rng.uniform(0.5, 3.5, (30, 2, 3)) * [1.0, 1.0, 0.0]
     result = register_map(LineMap.from_segments(lines), PointCloud(points=floor), CONFIG)
     assert result.verdict is not Verdict.ACCEPTED
