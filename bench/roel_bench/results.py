@@ -142,9 +142,10 @@ def config_digest(config: Config) -> str:
         del tables[table]
     if config.curves.method == "none":
         del tables["curves"]
-    if not config.refine.free_poses:
-        refine = tables["refine"]
-        tables["refine"] = {key: refine[key] for key in refine if not key.startswith("pose_")}
+    is_on = {"pose_": config.refine.free_poses, "corner_": config.refine.corner_sigma_m > 0}
+    off = tuple(prefix for prefix in is_on if not is_on[prefix])
+    refine = tables["refine"]
+    tables["refine"] = {key: refine[key] for key in refine if not key.startswith(off)}
     return digest_of(json.dumps(tables, sort_keys=True))
 
 

@@ -91,6 +91,7 @@ DEFAULT_ABLATION = (
     _without("all but 50 events a line", refine={"event_count_per_line": 50}),
     _without("robust loss", **_refined({"loss": "squared"})),
     _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
+    _without("corners", refine={"corner_sigma_m": 0.0}),
     _without("refinement", **_refined(NO_STEPS)),
     _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
     _without("uncertainty filter", trim={"max_sigma_m": UNLIMITED}),

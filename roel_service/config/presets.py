@@ -48,6 +48,7 @@ PAPER = Config(
         event_count_per_line=50,
         max_length_weight_px=UNLIMITED,
         direction_sigma_deg=0.0,
+        corner_sigma_m=0.0,
         max_residual_px=20.0,
         min_inlier_count=10,
     ),

@@ -312,7 +312,7 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
         max_length_weight_px: observations longer than this weigh no more.
         direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
             refines every line on its own.
-        direction_noise_px: noise of an observation as a whole, for the uncertainty of directions.
+        direction_noise_px: noise of an observation as a whole, against directions and corners.
         max_direction_distance: a line this many standard deviations from a shared direction, or
             fewer, is held to it.
         iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as they are.
@@ -349,12 +349,17 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         max_length_weight_px: observations longer than this weigh no more.
         direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
             refines every line on its own.
-        direction_noise_px: noise of an observation as a whole, for the uncertainty of directions.
+        direction_noise_px: noise of an observation as a whole, against directions and corners.
         max_direction_distance: a line this many standard deviations from a shared direction, or
             fewer, is held to it.
         iteration_count: Gauss-Newton steps at the most; 0 leaves the lines as triangulated.
         max_residual_px: observations beyond it are left out of the next step.
         min_inlier_count: a line with fewer has diverged.
+        corner_sigma_m: how far lines pass by the corners that they end at; 0 leaves corners alone.
+        corner_distance_px: the end of a line and a corner this close, as its cameras see them, are
+            one.
+        corner_depth_m: lines known better than this end at corners; lines known worse are held to
+            corners that agree about their depth within this.
         free_poses: refine the poses together with the lines, then map with the refined ones.
         pose_gates_px: with free poses, distance within which lines take up observations, one value
             a round of matching and refinement.
@@ -369,6 +374,9 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
     """
 
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
+    corner_sigma_m: float = parameter(0.02, NOT_NEGATIVE)
+    corner_distance_px: float = parameter(5.0, POSITIVE)
+    corner_depth_m: float = parameter(0.03, POSITIVE)
     free_poses: bool = False
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.0, 1.3), SOME_POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)

@@ -8,6 +8,7 @@ import numpy as np
 
 from roel_service.config.stages import Config
 from roel_service.mapping.cached_stages import CachedStages
+from roel_service.mapping.corners import held_at_corners
 from roel_service.mapping.curves import with_curves
 from roel_service.mapping.detect import LineDetector, line_detector
 from roel_service.mapping.directions import direction_prior
@@ -123,6 +124,7 @@ def build_line_map(
         refined = run.without_diverged(
             refine_lines(refined.lines, refined.tracks, evidence, frames, config.refine, prior)
         )
+        refined = run.without_diverged(held_at_corners(refined, evidence, frames, config))
     with run.stage("trim"):
         line_map, dropped = trim_to_segments(refined, evidence.views, frames, config.trim)
         run.count(dropped)

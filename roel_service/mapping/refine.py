@@ -117,6 +117,19 @@ class DirectionPrior:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class PointPrior:
+    """Points that lines are pulled to.
+
+    Attributes:
+        point: (L, 3) m, world; any where the weight is 0.
+        weight: (L,) px^2/m^2, of the squared distance between line and point.
+    """
+
+    point: FloatArray
+    weight: FloatArray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class OrthonormalLines:
     """Orthonormal lines about their own origins: U (L, 3, 3), phi (L,)."""
 
@@ -155,6 +168,7 @@ class _Problem:
         frames: Frames,
         config: RefineRoundsConfig,
         prior: DirectionPrior | None = None,
+        corners: PointPrior | None = None,
     ) -> None:
         self.config = config
         self.prior = prior
@@ -165,6 +179,7 @@ class _Problem:
         self.line = tracks.track_of_row
         views = evidence.views.take(tracks.observation)
         self.origin = self.mean(views.centre)
+        self.corners = corners and replace(corners, point=corners.point - self.origin)
         # As seen about the origin of each row's line.
         self.views = replace(views, centre=views.centre - self.origin[self.line])
         self.observation = tracks.observation
@@ -233,6 +248,8 @@ class _Problem:
             cost = cost + self._line_system(state, weight * self.weight).cost
         if self.prior is not None:
             cost = cost + direction_system(state, self.prior).cost
+        if self.corners is not None:
+            cost = cost + _point_system(state, self.corners).cost
         return cost
 
     def system(self, state: OrthonormalLines, weight: FloatArray) -> NormalEquations:
@@ -242,6 +259,8 @@ class _Problem:
             system = system + self._line_system(state, weight * self.weight)
         if self.prior is not None:
             system = system + direction_system(state, self.prior)
+        if self.corners is not None:
+            system = system + _point_system(state, self.corners)
         return system
 
     def _form_cost(self, state: OrthonormalLines, weight: FloatArray) -> FloatArray:
@@ -366,6 +385,19 @@ def direction_system(state: OrthonormalLines, prior: DirectionPrior) -> NormalEq
     )
 
 
+def _point_system(state: OrthonormalLines, prior: PointPrior) -> NormalEquations:
+    """Of sum w |p x v - m|^2, the squared distance between line and point; all about one origin."""
+    v, m = state.plucker
+    dv, dm = plucker.plucker_jacobians(state.U, state.phi)
+    r = np.cross(prior.point, v) - m
+    J = np.cross(prior.point[..., None], dv, axisa=-2, axisb=-2, axisc=-2) - dm
+    return NormalEquations(
+        cost=prior.weight * dot(r, r),
+        gradient=prior.weight[:, None] * np.einsum("lij,li->lj", J, r),
+        hessian=prior.weight[:, None, None] * np.swapaxes(J, -1, -2) @ J,
+    )
+
+
 def refine_lines(
     lines: InfiniteLines,
     tracks: LineTracks,
@@ -373,6 +405,7 @@ def refine_lines(
     frames: Frames,
     config: RefineRoundsConfig,
     prior: DirectionPrior | None = None,
+    corners: PointPrior | None = None,
 ) -> Refined:
     """Refine every line over its observations; the poses stay as they are.
 
@@ -383,8 +416,9 @@ def refine_lines(
         frames: poses and calibration.
         config: cost, loss, gates and number of steps.
         prior: directions that lines are held to, see `directions`.
+        corners: points that lines are held to, see `corners`.
     """
-    problem = _Problem(lines, tracks, evidence, frames, config, prior)
+    problem = _Problem(lines, tracks, evidence, frames, config, prior, corners)
     moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
     state = OrthonormalLines(U=U, phi=phi)
@@ -401,7 +435,7 @@ def refine_lines(
     in_pixels = problem
     if config.residual != "pixel" or problem.quartic:
         metric = replace(config, residual="pixel", loss="squared", event_weight=1.0)
-        in_pixels = _Problem(lines, tracks, evidence, frames, metric, prior)
+        in_pixels = _Problem(lines, tracks, evidence, frames, metric, prior, corners)
     information = in_pixels.system(state, weight).hessian
     return _refined(problem, tracks, state, residual_px, inlier, information)
 

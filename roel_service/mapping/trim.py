@@ -54,6 +54,21 @@ class _Segments:
     frame_count: IntArray
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SupportedPieces:
+    """Pieces of lines that enough observations bear out.
+
+    Attributes:
+        line: (n,) which line each is a piece of.
+        ends: (n, 2, 3) m, world.
+        sigma_m: (n,) standard deviation of the worse end across the line, as of a line map.
+    """
+
+    line: IntArray
+    ends: FloatArray
+    sigma_m: FloatArray
+
+
 def trim_to_segments(
     refined: Refined, views: Views, frames: Frames, config: TrimConfig
 ) -> tuple[LineMap, list[TrackStatus]]:
@@ -62,25 +77,52 @@ def trim_to_segments(
     Returns:
         The line map, and the status of each line that did not enter it.
     """
-    cuts = _cuts(refined.lines, refined.tracks, views)
-    if config.method == "cluster":
-        pieces = _clustered(refined, cuts, views, frames, config)
-    else:
-        pieces = _covered(refined, cuts, views, frames, config)
+    pieces = _pieces(refined, views, frames, config)
     dropped = [TrackStatus.TOO_SHORT] * (len(refined) - len(np.unique(pieces.line)))
     sigma_m = _sigma_m(refined, pieces)
-    support = pieces.frame_count / np.maximum(_frames_in_view(refined, pieces, frames), 1)
     checks = (
         (TrackStatus.UNCERTAIN, sigma_m <= config.max_sigma_m),
-        (TrackStatus.POOR_FIT, refined.rms_px[pieces.line] <= config.max_rms_px),
-        (TrackStatus.TOO_FEW_VIEWS, pieces.frame_count >= config.min_frame_count),
-        (TrackStatus.UNSUPPORTED, support >= config.min_support_ratio),
+        *_support_checks(refined, pieces, frames, config),
     )
     good = np.ones(len(pieces.line), dtype=bool)
     for status, passes in checks:
         dropped += [status] * int((good & ~passes).sum())
         good &= passes
     return _line_map(refined, pieces, sigma_m, good, config), dropped
+
+
+def supported_pieces(
+    refined: Refined, views: Views, frames: Frames, config: TrimConfig
+) -> SupportedPieces:
+    """The pieces that would enter the map if they were certain enough."""
+    pieces = _pieces(refined, views, frames, config)
+    good = np.ones(len(pieces.line), dtype=bool)
+    for _, passes in _support_checks(refined, pieces, frames, config):
+        good &= passes
+    return SupportedPieces(
+        line=pieces.line[good],
+        ends=_ends(refined, pieces)[good],
+        sigma_m=_sigma_m(refined, pieces)[good],
+    )
+
+
+def _pieces(refined: Refined, views: Views, frames: Frames, config: TrimConfig) -> _Segments:
+    cuts = _cuts(refined.lines, refined.tracks, views)
+    if config.method == "cluster":
+        return _clustered(refined, cuts, views, frames, config)
+    return _covered(refined, cuts, views, frames, config)
+
+
+def _support_checks(
+    refined: Refined, pieces: _Segments, frames: Frames, config: TrimConfig
+) -> tuple[tuple[TrackStatus, BoolArray], ...]:
+    """(n,) which pieces the observations bear out, by what they are called that fail."""
+    support = pieces.frame_count / np.maximum(_frames_in_view(refined, pieces, frames), 1)
+    return (
+        (TrackStatus.POOR_FIT, refined.rms_px[pieces.line] <= config.max_rms_px),
+        (TrackStatus.TOO_FEW_VIEWS, pieces.frame_count >= config.min_frame_count),
+        (TrackStatus.UNSUPPORTED, support >= config.min_support_ratio),
+    )
 
 
 def covered_spans(lines: InfiniteLines, tracks: LineTracks, views: Views) -> FloatArray:

@@ -62,6 +62,12 @@ def test_digest_does_not_follow_what_no_line_depends_on(tables):
     assert config_digest(with_tables(default, tables, subject="sample")) == config_digest(default)
 
 
+def test_digest_does_not_follow_corners_that_are_left_alone():
+    paper = preset("paper")
+    other = with_tables(paper, {"refine": {"corner_depth_m": 0.05}}, subject="sample")
+    assert config_digest(other) == config_digest(paper)
+
+
 @pytest.mark.parametrize(
     ("on", "parameter"),
     [
