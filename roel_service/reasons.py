@@ -167,6 +167,16 @@ _ROWS = (
     Reason("BLOB_TOO_LARGE", LimitError, "a blob, or a part of one, beyond the server's limit"),
     Reason("TOO_MANY_POSES", LimitError, "more poses than the server takes"),
     Reason("TOO_MANY_ALIASES", LimitError, "more aliases of a map than the server takes"),
+    Reason(
+        "QUOTA_STORAGE", LimitError, "more recordings and blobs, in bytes, than the caller may have"
+    ),
+    Reason("QUOTA_EVENT_STREAMS", LimitError, "more recordings than the caller may have"),
+    Reason(
+        "QUOTA_CONCURRENT_BUILDS",
+        LimitError,
+        "more operations at a time than the caller may have",
+        retry_after_s=5.0,
+    ),
     Reason("QUEUE_FULL", LimitError, "more work than the server lets wait", retry_after_s=5.0),
     Reason("UNAVAILABLE", UnavailableError, "a server that cannot be reached"),
     Reason(

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -861,15 +861,22 @@ def log_format(name: str | None) -> Iterator[None]:
         root.handlers = previous
 
 
-def create_token(data: Path, name: str, role: str, days: int | None) -> str:
-    """Name a caller of the server on a folder; its token."""
+def create_token(
+    data: Path, name: str, role: str, days: int | None, quota: Mapping[str, int | None]
+) -> str:
+    """Name a caller of the server on a folder; its token.
+
+    Args:
+        quota: fields of `store.quotas.Quota`.
+    """
     from roel_service.store.principals import Role
+    from roel_service.store.quotas import Quota
     from roel_service.store.records import now_us
     from roel_service.store.store import opened_principals
 
     expire_time_us = 0 if days is None else now_us() + days * US_PER_DAY
     with opened_principals(data) as principals:
-        return principals.create(name, Role[role.upper()], expire_time_us)
+        return principals.create(name, Role[role.upper()], expire_time_us, Quota(**quota))
 
 
 def list_tokens(data: Path) -> list[dict[str, Any]]:
@@ -883,6 +890,7 @@ def list_tokens(data: Path) -> list[dict[str, Any]]:
                 "role": item.role.label,
                 "created": _iso_time(item.create_time_us),
                 "expires": _iso_time(item.expire_time_us) if item.expire_time_us else None,
+                "quota": dataclasses.asdict(item.quota),
             }
             for item in principals.list()
         ]

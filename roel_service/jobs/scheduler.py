@@ -135,7 +135,7 @@ class Scheduler:
         """Admit an operation.
 
         Raises:
-            LimitError: QUEUE_FULL.
+            LimitError: QUEUE_FULL, QUOTA_CONCURRENT_BUILDS.
             UnavailableError: DRAINING.
             RoelError: whatever `begin` raises.
         """
@@ -171,6 +171,7 @@ class Scheduler:
             unfinished = await asyncio.to_thread(self._operations.unfinished)
             if len(unfinished) >= self._policy.unfinished_count:
                 raise LimitError("task", "room in the queue", "a full one", reason="QUEUE_FULL")
+            await asyncio.to_thread(self._operations.check_quota)
             record = await asyncio.to_thread(begin)
         self._work.set()
         return record

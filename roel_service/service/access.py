@@ -13,6 +13,7 @@ from roel_service.errors import PermissionDeniedError, UnauthenticatedError
 from roel_service.service.calls import Call
 from roel_service.service.rules import rule_of
 from roel_service.store.principals import Principal, Principals, Role, token_sha256
+from roel_service.store.quotas import CALLER, Caller
 
 # A look into the database for each call would double the cost of a lookup.
 REREAD_INTERVAL_S = 1.0
@@ -65,6 +66,8 @@ class Access:
         if call.principal.role < needed:
             expected, found = f"a caller with the role {needed.label}", call.principal.role.label
             raise PermissionDeniedError(call.method, expected, found)
+        # What the call makes is its caller's. A call is a task of its own, and so is its context.
+        CALLER.set(Caller(name=call.principal.name, quota=call.principal.quota))
         yield
 
     async def _reread(self) -> None:

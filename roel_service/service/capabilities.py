@@ -15,6 +15,7 @@ from roel_service.io.maps import EXPORT_FORMATS
 from roel_service.scene.results import MAPPING_STAGES
 from roel_service.service.methods import is_implemented, method_name
 from roel_service.service.settings import Settings
+from roel_service.store.quotas import CALLER
 from roel_service.store.store import Store
 from roel_service.v1 import capabilities_pb2
 from roel_service.wire import chunks, rlm
@@ -51,6 +52,20 @@ class CapabilitiesServicer:
             matchers=MATCHERS,
             methods=self._methods(),
             usage=capabilities_pb2.Usage(**asdict(await asyncio.to_thread(self._store.usage))),
+            quota=await asyncio.to_thread(self._quota),
+        )
+
+    def _quota(self) -> capabilities_pb2.Quota:
+        caller = CALLER.get()
+        has, may = self._store.holdings(caller), caller.quota
+        return capabilities_pb2.Quota(
+            caller=caller.name,
+            stored_bytes=has.stored_bytes,
+            event_stream_count=has.event_streams,
+            unfinished_operation_count=has.unfinished_operations,
+            max_stored_bytes=may.stored_bytes,
+            max_event_stream_count=may.event_streams,
+            max_unfinished_operation_count=may.unfinished_operations,
         )
 
     def _methods(self) -> list[capabilities_pb2.Method]:

@@ -40,6 +40,7 @@ from roel_service.store.chunk_reader import ChunkReader
 from roel_service.store.database import Database
 from roel_service.store.etags import check_etag
 from roel_service.store.locks import KeyedLocks
+from roel_service.store.quotas import CALLER, check_event_streams, check_stored_bytes
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import (
     UNFINISHED,
@@ -122,7 +123,12 @@ class EventStreams:
     def create(
         self, stream_id: str, camera: Camera, request: RequestId | None = None
     ) -> EventStreamRecord:
-        """Open a recording; raises `ConflictError` ALREADY_EXISTS."""
+        """Open a recording.
+
+        Raises:
+            ConflictError: ALREADY_EXISTS.
+            LimitError: QUOTA_EVENT_STREAMS.
+        """
         record = EventStreamRecord(
             id=stream_id,
             uid=uuid.uuid4().hex,
@@ -138,12 +144,14 @@ class EventStreams:
             fence=0,
             longest_gap_us=0,
             create_time_us=now_us(),
+            owner=CALLER.get().name,
         )
 
         def act(connection: Connection) -> EventStreamRecord:
             if _row(connection, stream_id) is not None:
                 expected = "an id not in use"
                 raise ConflictError("event stream", expected, stream_id, reason="ALREADY_EXISTS")
+            check_event_streams(connection)
             connection.execute(insert(EVENT_STREAM), row_from_record(record))
             self._recordings.create(record.uid)
             return record
@@ -189,12 +197,13 @@ class EventStreams:
             ConflictError: WRITER_REPLACED; CHUNK_CONFLICT, a stored chunk comes again with other
                 bytes.
             EventsError: a chunk that begins before the end of the one before it.
-            LimitError: EVENT_STREAM_TOO_LARGE.
+            LimitError: EVENT_STREAM_TOO_LARGE, QUOTA_STORAGE.
         """
         with self.locks.holding(stream_id):
             with self._database.read() as connection:
                 record = _get_writable(connection, stream_id, fence)
                 fresh = [chunk for chunk in chunks if not _is_repeat(connection, record, chunk)]
+                check_stored_bytes(connection, sum(chunk.length for chunk in fresh))
             if not fresh:
                 return record
             _check_order(record, fresh)

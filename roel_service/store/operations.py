@@ -28,6 +28,7 @@ from roel_service.errors import NotFoundError, StateError
 from roel_service.failpoints import failpoint
 from roel_service.progress import Progress
 from roel_service.store.database import Database
+from roel_service.store.quotas import CALLER, check_operations
 from roel_service.store.records import (
     UNFINISHED,
     Lease,
@@ -160,6 +161,11 @@ class Operations:
         with self._database.read() as connection:
             return [operation_from_row(row) for row in connection.execute(query).mappings()]
 
+    def check_quota(self) -> None:
+        """Raise `LimitError` QUOTA_CONCURRENT_BUILDS if the caller may not begin one more."""
+        with self._database.read() as connection:
+            check_operations(connection)
+
     def delete(self, operation_id: str) -> None:
         """Forget an operation, not what it made; raises `StateError` OPERATION_RUNNING."""
         with self._database.write() as connection:
@@ -228,6 +234,7 @@ def queued_operation(
         create_time_us=now_us(),
         end_time_us=0,
         expire_time_us=0,
+        owner=CALLER.get().name,
     )
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import re
 import secrets
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import IntEnum
 
 from sqlalchemy import Row, delete, func, insert, select
 
 from roel_service.errors import ConflictError, InputError, NotFoundError
 from roel_service.store.database import Database
+from roel_service.store.quotas import Quota
 from roel_service.store.records import now_us
 from roel_service.store.schema import PRINCIPAL
 
@@ -21,6 +22,9 @@ TOKEN_BYTES = 32
 
 # Also the names that certificates carry: host names, e-mail addresses, URIs.
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@/-]{0,254}")
+
+
+NO_LIMITS = Quota()
 
 
 class Role(IntEnum):
@@ -46,6 +50,7 @@ class Principal:
         token_sha256: digest of the token.
         create_time_us: microseconds since 1970.
         expire_time_us: from then on it is nobody; 0 for never.
+        quota: what it may have.
     """
 
     name: str
@@ -53,6 +58,7 @@ class Principal:
     token_sha256: str = field(default="", repr=False)
     create_time_us: int = 0
     expire_time_us: int = 0
+    quota: Quota = field(default_factory=Quota)
 
     @property
     def is_current(self) -> bool:
@@ -65,7 +71,9 @@ class Principals:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def create(self, name: str, role: Role, expire_time_us: int = 0) -> str:
+    def create(
+        self, name: str, role: Role, expire_time_us: int = 0, quota: Quota = NO_LIMITS
+    ) -> str:
         """Its token, which nobody can be told again: only a digest is kept.
 
         Raises:
@@ -87,6 +95,7 @@ class Principals:
                 "token_sha256": token_sha256(token),
                 "create_time_us": now_us(),
                 "expire_time_us": expire_time_us,
+                **{f"max_{key}": limit for key, limit in asdict(quota).items()},
             }
             connection.execute(insert(PRINCIPAL), row)
         return token
@@ -123,4 +132,5 @@ def _principal(row: Row[tuple[object, ...]]) -> Principal:
         token_sha256=row.token_sha256,
         create_time_us=row.create_time_us,
         expire_time_us=row.expire_time_us,
+        quota=Quota(**{key: getattr(row, f"max_{key}") for key in asdict(NO_LIMITS)}),
     )

@@ -81,6 +81,7 @@ class EventStreamRecord:
         digest: hexadecimal SHA-256 of all chunks in order; empty until finalized.
         fence: number of the writer that may append; grows with every takeover.
         longest_gap_us: longest time between two neighbouring events.
+        owner: on whose behalf it was made.
     """
 
     id: str
@@ -97,6 +98,7 @@ class EventStreamRecord:
     fence: int
     longest_gap_us: int
     create_time_us: int
+    owner: str = ""
 
     @property
     def etag(self) -> str:
@@ -184,6 +186,7 @@ class OperationRecord:
         update_seq: grows with every change.
         end_time_us, expire_time_us: 0 until it is final.
         result_sha256: file that belongs to the answer; empty if there is none.
+        owner: on whose behalf it runs.
     """
 
     id: str
@@ -205,6 +208,7 @@ class OperationRecord:
     end_time_us: int
     expire_time_us: int
     result_sha256: str = ""
+    owner: str = ""
 
 
 class TaskState(Enum):
@@ -260,12 +264,13 @@ class TaskRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class BlobRecord:
-    """A blob that is kept because it may be needed."""
+    """A blob that is kept because it may be needed; its owner uploaded it first."""
 
     sha256: str
     size_bytes: int
     create_time_us: int
     last_used_us: int
+    owner: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,6 +282,7 @@ class UploadRecord:
         sha256, size_bytes: what it is to become.
         committed_bytes: what is durable of it.
         fence: number of the writer that may append; grows with every takeover.
+        owner: on whose behalf it was begun.
     """
 
     id: str
@@ -285,6 +291,7 @@ class UploadRecord:
     committed_bytes: int
     fence: int
     expire_time_us: int
+    owner: str = ""
 
 
 def now_us() -> int:

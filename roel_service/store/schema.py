@@ -35,6 +35,7 @@ EVENT_STREAM = Table(
     Column("fence", BigInteger, nullable=False),
     Column("longest_gap_us", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
+    Column("owner", String, nullable=False),
 )
 
 EVENT_CHUNK = Table(
@@ -130,6 +131,7 @@ OPERATION = Table(
     Column("end_time_us", BigInteger, nullable=False),
     Column("expire_time_us", BigInteger, nullable=False),
     Column("result_sha256", String, nullable=False),
+    Column("owner", String, nullable=False),
 )
 
 TASK = Table(
@@ -174,6 +176,7 @@ BLOB = Table(
     Column("size_bytes", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
     Column("last_used_us", BigInteger, nullable=False),
+    Column("owner", String, nullable=False),
 )
 
 UPLOAD = Table(
@@ -185,6 +188,7 @@ UPLOAD = Table(
     Column("committed_bytes", BigInteger, nullable=False),
     Column("fence", BigInteger, nullable=False),
     Column("expire_time_us", BigInteger, nullable=False),
+    Column("owner", String, nullable=False),
 )
 
 PRINCIPAL = Table(
@@ -195,6 +199,9 @@ PRINCIPAL = Table(
     Column("token_sha256", String, nullable=False, unique=True),
     Column("create_time_us", BigInteger, nullable=False),
     Column("expire_time_us", BigInteger, nullable=False),
+    Column("max_stored_bytes", BigInteger),
+    Column("max_event_streams", BigInteger),
+    Column("max_unfinished_operations", BigInteger),
 )
 
 AUDIT = Table(
@@ -207,3 +214,6 @@ AUDIT = Table(
     Column("resource", String, nullable=False),
     Column("code", String, nullable=False),
 )
+
+for _table in (EVENT_STREAM, OPERATION, BLOB, UPLOAD):
+    Index(f"{_table.name}_owner", _table.c.owner)

@@ -25,6 +25,7 @@ from roel_service.store.garbage import LONGEST_UPLOAD_S, Swept, sweep_blobs
 from roel_service.store.maps import Maps
 from roel_service.store.operations import Operations
 from roel_service.store.principals import Principals
+from roel_service.store.quotas import Caller, Holdings, holdings_of
 from roel_service.store.recordings import Recordings
 from roel_service.store.records import OperationMethod
 from roel_service.store.refinements import RefinementCompletion, Refinements
@@ -116,6 +117,10 @@ class Store:
     def usage(self) -> Usage:
         """How much the folder holds, and how much is going on."""
         return usage_of(self._database)
+
+    def holdings(self, caller: Caller) -> Holdings:
+        """What a caller has."""
+        return holdings_of(self._database, caller)
 
     def problems(self) -> list[str]:
         """What keeps the store from working, a sentence each."""

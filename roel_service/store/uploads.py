@@ -26,6 +26,7 @@ from roel_service.store.database import Database
 from roel_service.store.event_streams import writer_replaced
 from roel_service.store.files import make_folder, sync_folder
 from roel_service.store.locks import KeyedLocks
+from roel_service.store.quotas import CALLER, check_stored_bytes
 from roel_service.store.records import BlobRecord, UploadRecord, now_us, row_from_record
 from roel_service.store.retention import DAY_US, UPLOAD_RETENTION_DAYS
 from roel_service.store.schema import BLOB, UPLOAD
@@ -59,13 +60,14 @@ class Uploads:
 
         Raises:
             ConflictError: ALREADY_EXISTS, the id is that of another blob's upload.
-            LimitError: TOO_MANY_UPLOADS.
+            LimitError: TOO_MANY_UPLOADS, QUOTA_STORAGE.
         """
         self.delete_expired()
         with self._locks.holding(upload_id), self._database.write() as connection:
             record = _find(connection, upload_id)
             if record is None:
                 _check_count(connection, max_upload_count)
+                check_stored_bytes(connection, size_bytes)
                 return self._begin(connection, upload_id, sha256, size_bytes)
             if (record.sha256, record.size_bytes) != (sha256, size_bytes):
                 expected = f"an upload of {record.sha256}"
@@ -108,7 +110,7 @@ class Uploads:
                 self._forget([upload_id])
                 raise
             with self._database.write() as connection:
-                blob = _used(connection, record.sha256, record.size_bytes)
+                blob = _used(connection, record.sha256, record.size_bytes, record.owner)
             self._forget([upload_id])
             return blob
 
@@ -164,6 +166,7 @@ class Uploads:
             committed_bytes=0,
             fence=1,
             expire_time_us=_expire_time_us(),
+            owner=CALLER.get().name,
         )
         self._path(upload_id).touch()
         sync_folder(self._folder)
@@ -250,10 +253,16 @@ def _expire_time_us() -> int:
     return now_us() + UPLOAD_RETENTION_DAYS * DAY_US
 
 
-def _used(connection: Connection, sha256: str, size_bytes: int) -> BlobRecord:
+def _used(connection: Connection, sha256: str, size_bytes: int, owner: str = "") -> BlobRecord:
     """Note that a blob is used now."""
     now = now_us()
-    fresh = BlobRecord(sha256=sha256, size_bytes=size_bytes, create_time_us=now, last_used_us=now)
+    fresh = BlobRecord(
+        sha256=sha256,
+        size_bytes=size_bytes,
+        create_time_us=now,
+        last_used_us=now,
+        owner=owner,
+    )
     statement = upsert(BLOB).values(row_from_record(fresh))
     changed = statement.on_conflict_do_update(set_={"last_used_us": now}).returning(BLOB)
     return BlobRecord(**connection.execute(changed).mappings().one())

@@ -10,6 +10,7 @@ from roel_client.cli.output import print_result
 from roel_client.cli.parser import Command, Subparsers, command, command_group, integer, one_of
 from roel_client.cli.staging import Staged
 
+GIB = 2**30
 ROLES = ("localize_only", "reader", "builder", "admin")
 
 
@@ -29,6 +30,15 @@ def _add_create(group: Subparsers) -> None:
     )
     create.add_argument(
         "--days", type=integer(1, 36500), metavar="N", help="the token expires then (never)"
+    )
+    create.add_argument(
+        "--max-gib", type=integer(1, 10**6), metavar="N", help="most recordings and blobs, in GiB"
+    )
+    create.add_argument(
+        "--max-recordings", type=integer(1, 10**9), metavar="N", help="most recordings"
+    )
+    create.add_argument(
+        "--max-operations", type=integer(1, 10**6), metavar="N", help="most builds at a time"
     )
 
 
@@ -52,7 +62,12 @@ def make_token(options: argparse.Namespace, staged: Staged) -> None:
     """Print a new token."""
     from roel_client import local
 
-    token = local.create_token(Path(options.data), options.name, options.role, options.days)
+    quota = {
+        "stored_bytes": options.max_gib and options.max_gib * GIB,
+        "event_streams": options.max_recordings,
+        "unfinished_operations": options.max_operations,
+    }
+    token = local.create_token(Path(options.data), options.name, options.role, options.days, quota)
     told = {"name": options.name, "role": options.role, "token": token}
     print_result(told, token, as_json=options.json)
 
@@ -63,9 +78,16 @@ def list_tokens(options: argparse.Namespace, staged: Staged) -> None:
 
     callers = local.list_tokens(Path(options.data))
     lines = [
-        f"{item['name']:<24}{item['role']:<16}{item['expires'] or 'never'}" for item in callers
+        f"{item['name']:<24}{item['role']:<16}{item['expires'] or 'never':<28}{_limits(item['quota'])}"
+        for item in callers
     ]
     print_result({"tokens": callers}, "\n".join(lines), as_json=options.json)
+
+
+def _limits(quota: dict[str, int | None]) -> str:
+    """What a caller may have, in words; nothing where nothing limits it."""
+    told = {name: limit for name, limit in quota.items() if limit is not None}
+    return ", ".join(f"{name.replace('_', ' ')} {limit}" for name, limit in told.items())
 
 
 def revoke_token(options: argparse.Namespace, staged: Staged) -> None:

@@ -20,6 +20,7 @@ from roel_service.store.migrations import (
     m007_principals,
     m008_results,
     m009_undeleted_versions,
+    m010_owners,
 )
 
 # Step k leads from version k to k + 1.
@@ -33,6 +34,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m007_principals.migrate,
     m008_results.migrate,
     m009_undeleted_versions.migrate,
+    m010_owners.migrate,
 )
 
 
