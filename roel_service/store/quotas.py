@@ -67,32 +67,30 @@ def check_stored_bytes(connection: Connection, more_bytes: int) -> None:
     """Raise `LimitError` QUOTA_STORAGE if the caller may not have so much more."""
     caller = CALLER.get()
     limit_bytes = caller.quota.stored_bytes
-    if limit_bytes is not None:
-        found_bytes = _stored_bytes(connection, caller) + more_bytes
-        _check(found_bytes, limit_bytes, f"stored bytes of {caller.name}", reason="QUOTA_STORAGE")
+    if limit_bytes is None:
+        return
+    found_bytes = _stored_bytes(connection, caller) + more_bytes
+    if found_bytes > limit_bytes:
+        subject, expected = f"stored bytes of {caller.name}", f"at most {limit_bytes}"
+        raise LimitError(subject, expected, f"{found_bytes}", reason="QUOTA_STORAGE")
 
 
 def check_event_streams(connection: Connection) -> None:
     """Raise `LimitError` QUOTA_EVENT_STREAMS if the caller may not have one more."""
     caller = CALLER.get()
     limit = caller.quota.event_streams
-    if limit is not None:
-        found = _count(connection, _streams_of(caller)) + 1
-        _check(found, limit, f"recordings of {caller.name}", reason="QUOTA_EVENT_STREAMS")
+    if limit is not None and _count(connection, _streams_of(caller)) >= limit:
+        subject, expected = f"recordings of {caller.name}", f"at most {limit}"
+        raise LimitError(subject, expected, "one more", reason="QUOTA_EVENT_STREAMS")
 
 
 def check_operations(connection: Connection) -> None:
     """Raise `LimitError` QUOTA_CONCURRENT_BUILDS if the caller may not have one more."""
     caller = CALLER.get()
     limit = caller.quota.unfinished_operations
-    if limit is not None:
-        found = _count(connection, _operations_of(caller)) + 1
-        _check(found, limit, f"operations of {caller.name}", reason="QUOTA_CONCURRENT_BUILDS")
-
-
-def _check(found: int, limit: int, subject: str, *, reason: str) -> None:
-    if found > limit:
-        raise LimitError(subject, f"at most {limit}", f"{found}", reason=reason)
+    if limit is not None and _count(connection, _operations_of(caller)) >= limit:
+        subject, expected = f"operations of {caller.name}", f"at most {limit} at a time"
+        raise LimitError(subject, expected, "one more", reason="QUOTA_CONCURRENT_BUILDS")
 
 
 def _stored_bytes(connection: Connection, caller: Caller) -> int:
