@@ -186,6 +186,12 @@ _ROWS = (
     ),
     Reason("DRAINING", UnavailableError, "a server that is about to end", retry_after_s=2.0),
     Reason(
+        "STORE_UNAVAILABLE",
+        UnavailableError,
+        "a data folder that cannot be read or written, such as one on a full disk",
+        retry_after_s=5.0,
+    ),
+    Reason(
         "WORKER_LOST",
         UnavailableError,
         "work whose process was killed, or whose server was, in all attempts",

@@ -18,6 +18,7 @@ from roel_service.jobs.preparation import Prepare
 from roel_service.jobs.retries import MAX_ATTEMPT_COUNT, Retry, judge
 from roel_service.jobs.task import GIB, Limits, News, Partial, TaskSpec, Usage
 from roel_service.progress import Progress
+from roel_service.store.faults import store_failure
 from roel_service.store.operations import Operations
 from roel_service.store.records import (
     OperationMethod,
@@ -222,7 +223,8 @@ class Scheduler:
         except RoelError as error:
             await self._settle(task, error)
         except Exception as error:  # the border of the operation: whatever is left is a bug
-            await self._settle(task, logged_fault(error, f"operation {task.operation_id}"))
+            fault = store_failure(error) or logged_fault(error, f"operation {task.operation_id}")
+            await self._settle(task, fault)
 
     async def _outcome(self, task: TaskRecord) -> Any:
         if task.attempt_count > MAX_ATTEMPT_COUNT:

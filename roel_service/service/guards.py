@@ -20,6 +20,7 @@ from roel_service.jobs.faults import logged_fault
 from roel_service.service.calls import Call
 from roel_service.service.rules import Pool, rule_of
 from roel_service.service.settings import Settings
+from roel_service.store.faults import store_failure
 from roel_service.wire.errors import status_from_error
 
 
@@ -27,15 +28,15 @@ from roel_service.wire.errors import status_from_error
 async def told_errors(call: Call) -> AsyncIterator[None]:
     """Ends a failed call with a `google.rpc.Status`; nobody else aborts.
 
-    A `RoelError` is told with all its details. Anything else is a bug: it is logged with an id,
-    and the caller learns the id alone.
+    A `RoelError` is told with all its details, and so is a disk that fails. Anything else is a bug: it
+    is logged with an id, and the caller learns the id alone.
     """
     try:
         yield
     except RoelError as error:
         await _abort(call, error)
     except Exception as error:  # the border of the server: whatever is left is a bug
-        await _abort(call, logged_fault(error, call.method))
+        await _abort(call, store_failure(error) or logged_fault(error, call.method))
 
 
 async def _abort(call: Call, error: RoelError) -> None:

@@ -1,6 +1,7 @@
 import asyncio
 import json
 import re
+import resource
 import signal
 import subprocess
 import sys
@@ -99,6 +100,24 @@ def test_a_fault_is_told_by_its_id_alone(server, client):
     assert str(server.folder) not in str(caught.value)
     assert f"fault {fault_id} in /roel_service.v1.EventStreamService/AppendEvents" in server.log
     assert "FileNotFoundError" in server.log
+
+
+def test_a_full_disk_is_told_and_the_server_goes_on_when_there_is_room(start_server):
+    server = start_server()
+    with Client(server.address, retry=NO_RETRY) as client:
+        client.create_map("before")
+        kept = resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (1, kept[1]))
+        with pytest.raises(UnavailableError) as caught:
+            client.create_map("meanwhile")
+        assert (caught.value.reason, caught.value.retry_after_s) == ("STORE_UNAVAILABLE", 5.0)
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, kept)
+        client.create_map("after")
+        assert [item.name for item in client.maps()] == [
+            "projects/default/maps/after",
+            "projects/default/maps/before",
+        ]
+    assert server.stop() == 0
 
 
 def test_the_module_announces_its_address_and_ends_with_0(folder):
