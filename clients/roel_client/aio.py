@@ -11,11 +11,12 @@ import contextlib
 import hashlib
 import tempfile
 import uuid
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
+from google.protobuf.field_mask_pb2 import FieldMask
 from google.protobuf.message import Message
 
 from roel_client.connection import AsyncConnection, AsyncExchange, Endpoint, Tls
@@ -278,6 +279,11 @@ class AsyncClient:
         """What the server has of a recording."""
         request = events_pb2.GetEventStreamRequest(name=name)
         return await self._connection.call(self._streams.GetEventStream, request)
+
+    async def event_streams(self) -> list[events_pb2.EventStream]:
+        """All recordings, in the order of their ids."""
+        request = events_pb2.ListEventStreamsRequest(parent=names.PROJECT)
+        return await self._listed(self._streams.ListEventStreams, request)
 
     async def read_events(
         self, name: str, start_us: int | None = None, stop_us: int | None = None
@@ -543,6 +549,11 @@ class AsyncClient:
         """An operation that was begun before, perhaps by somebody else."""
         return AsyncOperation(self._connection, name)
 
+    async def operations(self) -> list[operations_pb2.Operation]:
+        """All operations that are remembered."""
+        stub = operations_pb2_grpc.OperationsStub(self._connection.channel)
+        return await self._listed(stub.ListOperations, operations_pb2.ListOperationsRequest())
+
     async def map_version(self, name: str) -> maps_pb2.MapVersion:
         """One version of a map; its last part may be `latest`."""
         request = maps_pb2.GetMapVersionRequest(name=name)
@@ -604,27 +615,28 @@ class AsyncClient:
 
     async def maps(self, *, show_deleted: bool = False) -> list[maps_pb2.Map]:
         """All maps, in the order of their ids."""
-        found: list[maps_pb2.Map] = []
-        token: str | None = ""
-        while token is not None:
-            request = maps_pb2.ListMapsRequest(
-                parent=names.PROJECT, page_token=token, show_deleted=show_deleted
-            )
-            page = await self._connection.call(self._maps.ListMaps, request)
-            found += page.maps
-            token = page.next_page_token or None
-        return found
+        request = maps_pb2.ListMapsRequest(parent=names.PROJECT, show_deleted=show_deleted)
+        return await self._listed(self._maps.ListMaps, request)
 
     async def map_versions(self, map_name: str) -> list[maps_pb2.MapVersion]:
         """All versions of a map, oldest first."""
-        found: list[maps_pb2.MapVersion] = []
-        token: str | None = ""
-        while token is not None:
-            request = maps_pb2.ListMapVersionsRequest(parent=map_name, page_token=token)
-            page = await self._connection.call(self._maps.ListMapVersions, request)
-            found += page.map_versions
-            token = page.next_page_token or None
-        return found
+        request = maps_pb2.ListMapVersionsRequest(parent=map_name)
+        return await self._listed(self._maps.ListMapVersions, request)
+
+    async def update_map(
+        self,
+        name: str,
+        *,
+        display_name: str | None = None,
+        labels: Mapping[str, str] | None = None,
+        etag: str = "",
+    ) -> maps_pb2.Map:
+        """Change what is given; labels are replaced as a whole."""
+        changes = {"display_name": display_name, "labels": labels}
+        paths = [field for field, value in changes.items() if value is not None]
+        changed = maps_pb2.Map(name=name, display_name=display_name, labels=labels, etag=etag)
+        request = maps_pb2.UpdateMapRequest(map=changed, update_mask=FieldMask(paths=paths))
+        return await self._connection.call(self._maps.UpdateMap, request)
 
     async def promote(self, version_name: str, alias: str, *, etag: str = "") -> maps_pb2.Map:
         """Let an alias name a version; naming an older one than before rolls back."""
@@ -664,6 +676,16 @@ class AsyncClient:
         """Delete a map with all its versions; it can be undeleted unless it is purged."""
         request = maps_pb2.DeleteMapRequest(name=name, purge=purge)
         await self._connection.call(self._maps.DeleteMap, request)
+
+    async def _listed(self, method: Any, request: Any) -> list[Any]:
+        """All items of a list, page by page; the first field of an answer holds them."""
+        found: list[Any] = []
+        while True:
+            page = await self._connection.call(method, request)
+            found += getattr(page, page.DESCRIPTOR.fields[0].name)
+            if not page.next_page_token:
+                return found
+            request.page_token = page.next_page_token
 
     async def _append_events(self, stream: str, upload: EventUpload) -> None:
         async with self._connection.exchange(self._streams.AppendEvents) as exchange:

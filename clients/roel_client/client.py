@@ -8,11 +8,12 @@ import hashlib
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
+from google.protobuf.field_mask_pb2 import FieldMask
 from google.protobuf.message import Message
 
 from roel_client.connection import Connection, Endpoint, Exchange, Tls
@@ -274,6 +275,11 @@ class Client:
         request = events_pb2.GetEventStreamRequest(name=name)
         return self._connection.call(self._streams.GetEventStream, request)
 
+    def event_streams(self) -> list[events_pb2.EventStream]:
+        """All recordings, in the order of their ids."""
+        request = events_pb2.ListEventStreamsRequest(parent=names.PROJECT)
+        return self._listed(self._streams.ListEventStreams, request)
+
     def read_events(
         self, name: str, start_us: int | None = None, stop_us: int | None = None
     ) -> Iterator[EventSlice]:
@@ -530,6 +536,11 @@ class Client:
         """An operation that was begun before, perhaps by somebody else."""
         return Operation(self._connection, name)
 
+    def operations(self) -> list[operations_pb2.Operation]:
+        """All operations that are remembered."""
+        stub = operations_pb2_grpc.OperationsStub(self._connection.channel)
+        return self._listed(stub.ListOperations, operations_pb2.ListOperationsRequest())
+
     def map_version(self, name: str) -> maps_pb2.MapVersion:
         """One version of a map; its last part may be `latest`."""
         request = maps_pb2.GetMapVersionRequest(name=name)
@@ -591,27 +602,28 @@ class Client:
 
     def maps(self, *, show_deleted: bool = False) -> list[maps_pb2.Map]:
         """All maps, in the order of their ids."""
-        found: list[maps_pb2.Map] = []
-        token: str | None = ""
-        while token is not None:
-            request = maps_pb2.ListMapsRequest(
-                parent=names.PROJECT, page_token=token, show_deleted=show_deleted
-            )
-            page = self._connection.call(self._maps.ListMaps, request)
-            found += page.maps
-            token = page.next_page_token or None
-        return found
+        request = maps_pb2.ListMapsRequest(parent=names.PROJECT, show_deleted=show_deleted)
+        return self._listed(self._maps.ListMaps, request)
 
     def map_versions(self, map_name: str) -> list[maps_pb2.MapVersion]:
         """All versions of a map, oldest first."""
-        found: list[maps_pb2.MapVersion] = []
-        token: str | None = ""
-        while token is not None:
-            request = maps_pb2.ListMapVersionsRequest(parent=map_name, page_token=token)
-            page = self._connection.call(self._maps.ListMapVersions, request)
-            found += page.map_versions
-            token = page.next_page_token or None
-        return found
+        request = maps_pb2.ListMapVersionsRequest(parent=map_name)
+        return self._listed(self._maps.ListMapVersions, request)
+
+    def update_map(
+        self,
+        name: str,
+        *,
+        display_name: str | None = None,
+        labels: Mapping[str, str] | None = None,
+        etag: str = "",
+    ) -> maps_pb2.Map:
+        """Change what is given; labels are replaced as a whole."""
+        changes = {"display_name": display_name, "labels": labels}
+        paths = [field for field, value in changes.items() if value is not None]
+        changed = maps_pb2.Map(name=name, display_name=display_name, labels=labels, etag=etag)
+        request = maps_pb2.UpdateMapRequest(map=changed, update_mask=FieldMask(paths=paths))
+        return self._connection.call(self._maps.UpdateMap, request)
 
     def promote(self, version_name: str, alias: str, *, etag: str = "") -> maps_pb2.Map:
         """Let an alias name a version; naming an older one than before rolls back."""
@@ -651,6 +663,16 @@ class Client:
         """Delete a map with all its versions; it can be undeleted unless it is purged."""
         request = maps_pb2.DeleteMapRequest(name=name, purge=purge)
         self._connection.call(self._maps.DeleteMap, request)
+
+    def _listed(self, method: Any, request: Any) -> list[Any]:
+        """All items of a list, page by page; the first field of an answer holds them."""
+        found: list[Any] = []
+        while True:
+            page = self._connection.call(method, request)
+            found += getattr(page, page.DESCRIPTOR.fields[0].name)
+            if not page.next_page_token:
+                return found
+            request.page_token = page.next_page_token
 
     def _append_events(self, stream: str, upload: EventUpload) -> None:
         with self._connection.exchange(self._streams.AppendEvents) as exchange:

@@ -53,9 +53,9 @@ class RetryPolicy:
     longest_pause_s: float = 4.0
 
 
-# Uploads and watches are taken up again where they broke; even a busy machine restarts a server
-# within the 15 s that these pauses make.
-RESUMING = RetryPolicy(attempt_count=8)
+# Uploads and watches are taken up again where they broke. A machine that boots is back within the
+# minute that these pauses make; what was acknowledged begins them anew.
+RESUMING = RetryPolicy(attempt_count=20)
 NO_RETRY = RetryPolicy(attempt_count=1)
 
 

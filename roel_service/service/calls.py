@@ -25,6 +25,9 @@ MAX_REQUEST_ID_LENGTH = 64
 # Fields by which requests name what they are about, the most particular first.
 RESOURCE_FIELDS = ("name", "map_version", "event_stream", "parent")
 
+# Answers that say something about the data, and the field that says it.
+VERDICT_FIELDS = {"RegisterResponse": "verdict", "LocalizeResponse": "status"}
+
 Behavior = Callable[[Any, Any], Any]
 
 
@@ -44,6 +47,7 @@ class Call:
         principal: who calls, once that is known.
         resource: what the request names.
         operation: the long-running operation that the call is about, if any.
+        verdict: what an answer says about the data, if it says anything.
         received_bytes, sent_bytes: of messages.
     """
 
@@ -57,6 +61,7 @@ class Call:
     principal: Principal | None = None
     resource: str = ""
     operation: str = ""
+    verdict: str = ""
     received_bytes: int = 0
     sent_bytes: int = 0
 
@@ -69,8 +74,13 @@ class Call:
     def see_response(self, message: Any) -> None:
         """Take note of what is answered."""
         self.sent_bytes += message.ByteSize()
-        if message.DESCRIPTOR.full_name == "google.longrunning.Operation":
+        kind = message.DESCRIPTOR
+        if kind.full_name == "google.longrunning.Operation":
             self.operation = message.name
+        elif kind.name in VERDICT_FIELDS:
+            field_of = kind.fields_by_name[VERDICT_FIELDS[kind.name]]
+            number = getattr(message, field_of.name)
+            self.verdict = field_of.enum_type.values_by_number[number].name
 
 
 # With which status a call of a method is refused before it is looked at; None lets it through.

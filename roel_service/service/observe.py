@@ -17,7 +17,7 @@ from roel_service.service.calls import Call
 from roel_service.service.metrics import Counter, Gauge, Histogram, Labels, exposition
 from roel_service.service.rules import rule_of
 from roel_service.store.audit import Audit
-from roel_service.store.records import OperationMethod, OperationRecord, OperationState
+from roel_service.store.records import OperationMethod, OperationRecord, OperationState, now_us
 from roel_service.store.store import Store
 from roel_service.v1 import operations_pb2
 from roel_service.wire.errors import code_of
@@ -79,12 +79,23 @@ class Metrics:
             help="Seconds of the stages of builds that succeeded.",
             label_names=("stage",),
         )
+        self.verdicts = Counter(
+            name="roel_verdicts_total",
+            help="Answers of Register and Localize, by what they say about the data.",
+            label_names=("method", "verdict"),
+        )
         self._looked_up = (
             Gauge(
                 name="roel_operations",
                 help="Long-running operations that have not ended, by state.",
                 label_names=("state",),
                 read=self._operations,
+            ),
+            Gauge(
+                name="roel_oldest_operation_seconds",
+                help="Age of the oldest long-running operation that has not ended, by state.",
+                label_names=("state",),
+                read=self._oldest_operations,
             ),
             Gauge(
                 name="roel_process_cpu_seconds_total",
@@ -132,6 +143,7 @@ class Metrics:
             self.cpu_seconds,
             self.stage_units,
             self.stage_seconds,
+            self.verdicts,
         )
         return exposition((*counted, *self._looked_up))
 
@@ -140,6 +152,13 @@ class Metrics:
         for record in self._store.operations.unfinished():
             counts[record.state] += 1
         return {(state.value,): count for state, count in counts.items()}
+
+    def _oldest_operations(self) -> dict[Labels, float]:
+        now = now_us()
+        oldest_us = dict.fromkeys((OperationState.QUEUED, OperationState.RUNNING), now)
+        for record in self._store.operations.unfinished():
+            oldest_us[record.state] = min(oldest_us[record.state], record.create_time_us)
+        return {(state.value,): (now - time_us) / 1e6 for state, time_us in oldest_us.items()}
 
 
 def _peak_memory() -> dict[Labels, float]:
@@ -173,6 +192,8 @@ class Observation:
         metrics.seconds.observe(call.method, code, value=spent_s)
         metrics.received_bytes.add(call.method, amount=call.received_bytes)
         metrics.sent_bytes.add(call.method, amount=call.sent_bytes)
+        if call.verdict:
+            metrics.verdicts.add(call.method, call.verdict)
         if not logger.isEnabledFor(logging.INFO):
             return
         fields = {

@@ -51,6 +51,21 @@ def test_maps_and_versions_are_listed(client, versions):
     assert gone in {item.name for item in client.maps()}
 
 
+def test_what_people_call_a_map_is_changed(client):
+    name = client.create_map(new_id())
+    labelled = client.update_map(name, labels={"site": "1"})
+    changed = client.update_map(name, display_name="Kitchen", etag=labelled.etag)
+    assert (changed.display_name, dict(changed.labels)) == ("Kitchen", {"site": "1"})
+    assert client.map(name) == changed
+
+
+def test_recordings_and_operations_are_listed(client, versions):
+    name = client.map_version(versions[0]).operation
+    assert name in {item.name for item in client.operations()}
+    stream = client.create_event_stream(new_id(), CAMERA)
+    assert stream in {item.name for item in client.event_streams()}
+
+
 def test_a_deleted_version_comes_back_as_it_was(client, versions):
     _, second = versions
     before = client.map_version(second)

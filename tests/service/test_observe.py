@@ -1,5 +1,6 @@
 """What an operator sees of a server: metrics, probes, log lines."""
 
+import asyncio
 import http.client
 import json
 import re
@@ -10,10 +11,12 @@ import pytest
 from roel_client import Client
 from roel_client.connection import Connection, Endpoint
 from roel_service.errors import LimitError, NotFoundError
-from roel_service.v1 import maps_pb2, maps_pb2_grpc
+from roel_service.service.calls import Call
+from roel_service.service.observe import Metrics, Observation
+from roel_service.v1 import localization_pb2, maps_pb2, maps_pb2_grpc, registration_pb2
 
 from .processes import Server, config_of, new_id, ready_recording
-from .sample_builds import QUICK
+from .sample_builds import QUICK, SLOW_ONCE
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +103,38 @@ def test_operations_that_ended_are_counted_with_their_stages(server, sample):
     assert sample('roel_operation_attempts_total{method="BuildMap"}') >= 1
     assert sample('roel_stage_units_total{stage="detect",cached="no"}') >= 1
     assert sample('roel_stage_seconds_sum{stage="detect"}') >= 0.25
+
+
+def test_the_oldest_operation_is_told(server, sample):
+    with Client(server.address) as client:
+        stream = ready_recording(client)
+        operation = client.build_map(client.create_map(new_id()), stream, config_of(SLOW_ONCE))
+        states = ("queued", "running")
+        ages_s = [sample(f'roel_oldest_operation_seconds{{state="{state}"}}') for state in states]
+        assert max(ages_s) > 0
+        operation.cancel()
+    assert sample('roel_oldest_operation_seconds{state="running"}') == 0
+
+
+def test_verdicts_are_taken_from_answers():
+    call = Call(method="Localize")
+    response = localization_pb2.LocalizeResponse
+    call.see_response(response(status=response.STATUS_AMBIGUOUS))
+    assert call.verdict == "STATUS_AMBIGUOUS"
+    call.see_response(registration_pb2.RegisterResponse(verdict=1))
+    assert call.verdict == "VERDICT_ACCEPTED"
+
+
+def test_verdicts_are_counted():
+    metrics = Metrics(store=None)
+
+    async def main():
+        async with Observation(metrics)(call := Call(method="Localize")):
+            call.verdict = "STATUS_FOUND"
+
+    asyncio.run(main())
+    shown = 'roel_verdicts_total{method="Localize",verdict="STATUS_FOUND"} 1'
+    assert shown in "\n".join(metrics.verdicts.lines())
 
 
 def test_probes_answer(get):
