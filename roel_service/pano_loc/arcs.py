@@ -7,6 +7,7 @@ cover the sphere; their ends become rays, and from there on nothing knows of cro
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -19,18 +20,36 @@ from roel_service.geometry import sphere
 from roel_service.geometry.vectors import dot, unit
 from roel_service.pano_loc import arcs_kernels
 
-# Crops look along these azimuths at these elevations, degrees; their views overlap by half.
-CROP_RINGS = ((0.0, 12), (45.0, 6), (-45.0, 6), (90.0, 1), (-90.0, 1))
-CROP_FIELD_OF_VIEW_RAD = np.deg2rad(60.0)
+# Crops, and poses, are worked on side by side; what takes time does not hold the interpreter's lock.
+THREAD_COUNT = 2
 # OpenCV's LSD at its default scale of 0.8 puts lines this far to the upper left (px).
 LSD_OFFSET_PX = -0.125
 BLUR_PX = 0.7
+# Edges along the border of a crop are bent; the crop next to it has them whole.
+BORDER_PX = 4.0
 # Shorter detections have no direction to speak of.
 MIN_PIECE_RAD = np.deg2rad(1.2)
 # Pieces whose ends are this close to a longer piece's circle, with gaps no longer than this
 # between them, are one line.
-JOIN_DISTANCE_RAD = np.deg2rad(0.25)
+JOIN_DISTANCE_RAD = np.deg2rad(0.3)
 JOIN_GAP_RAD = np.deg2rad(2.0)
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """Square perspective views that cover the sphere.
+
+    Attributes:
+        rings: elevation, degrees, and how many views look along evenly spaced azimuths there.
+        field_of_view_deg: of each, in both directions.
+    """
+
+    rings: tuple[tuple[float, int], ...]
+    field_of_view_deg: float
+
+
+# Few views, which overlap by some degrees: looking for lines is most of the time of a query.
+TILING = Tiling(((0.0, 6), (45.0, 5), (-45.0, 5), (90.0, 1), (-90.0, 1)), 66.0)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,13 +111,17 @@ def detect_arcs(grey: Array, config: LocalizeConfig) -> PanoramaArcs:
     """The straight edges of an (H, 2H) uint8 panorama."""
     grey = _limited(grey, config.max_width_px)
     padded = _padded(cv2.GaussianBlur(grey, (0, 0), BLUR_PX, borderType=cv2.BORDER_REPLICATE))
-    starts, ends = [np.empty((0, 3))], [np.empty((0, 3))]
-    for crop in crops(grey.shape[1], config.crop_px):
+
+    def pieces_in(crop: Crop) -> FloatArray:
         view = cv2.remap(padded, crop.column_px, crop.row_px, cv2.INTER_LINEAR)
-        rays = crop.rays(detect_pieces(view))
-        starts.append(rays[:, 0])
-        ends.append(rays[:, 1])
-    return whole_arcs(np.concatenate(starts), np.concatenate(ends), config)
+        pieces = detect_pieces(view)
+        from_center_px = np.abs(pieces.mean(axis=1) - crop.center_px).max(axis=1)
+        return crop.rays(pieces[from_center_px <= crop.center_px - BORDER_PX])
+
+    with ThreadPoolExecutor(THREAD_COUNT) as threads:
+        found = threads.map(pieces_in, crops(grey.shape[1], config.crop_px, TILING))
+        rays = np.concatenate(list(found))
+    return whole_arcs(rays[:, 0], rays[:, 1], config)
 
 
 def detect_pieces(view: Array) -> Array:
@@ -178,13 +201,13 @@ class Crop:
         return unit(camera @ self.R_panorama_camera.T)
 
 
-@lru_cache(maxsize=1)  # tables of 20 MB that depend on the size of the picture alone
-def crops(width: int, size_px: int) -> tuple[Crop, ...]:
+@lru_cache(maxsize=1)  # tables of some MB that depend on the size of the picture alone
+def crops(width: int, size_px: int, tiling: Tiling) -> tuple[Crop, ...]:
     """The crops that cover a panorama of this width."""
-    focal_px = 0.5 * size_px / np.tan(CROP_FIELD_OF_VIEW_RAD / 2)
+    focal_px = 0.5 * size_px / np.tan(np.deg2rad(tiling.field_of_view_deg) / 2)
     center_px = (size_px - 1) / 2
     found = []
-    for elevation_deg, count in CROP_RINGS:
+    for elevation_deg, count in tiling.rings:
         for azimuth_rad in np.arange(count) * (2.0 * np.pi / count):
             R = _looking_along(azimuth_rad, np.deg2rad(elevation_deg))
             blank = Crop(

@@ -19,7 +19,7 @@ VOTE_WIDTH_RAD = np.deg2rad(2.0)
 MEMBER_RAD = np.deg2rad(6.0)
 # Directions are sought among those of this many longest lines, or crossings of longest arcs.
 CANDIDATE_LINE_COUNT = 400
-CROSSED_ARC_COUNT = 60
+CROSSED_ARC_COUNT = 40
 # Circles closer than this cross anywhere.
 MIN_CROSSING_SINE = np.sin(np.deg2rad(5.0))
 ROUND_COUNT = 8

@@ -100,7 +100,7 @@ def _searched(
     if len(rotations) == 0:
         return Found(hypotheses=(), rotation_count=0, candidate_count=0)
     candidates = coarse_candidates(arcs, prepared, rotations, config, prior)
-    refined = refine_poses(candidates, arcs, prepared, config)
+    refined = refine_poses(candidates, arcs, prepared)
     if prior is not None:
         refined = refined.take(prior.holds(refined.poses))
     return Found(

@@ -15,7 +15,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.segments import sample_segments
-from roel_service.geometry.vectors import unit
+from roel_service.geometry.vectors import dot, norm, unit
 from roel_service.pano_loc.directions import class_of, principal_frame, shared_directions
 from roel_service.pano_loc.views import (
     ClassedLines,
@@ -27,8 +27,10 @@ from roel_service.pano_loc.views import (
 from roel_service.scene.lines import LineMap
 
 MAX_CHANNEL_COUNT = 6
-# Views at all places: of the longest lines, in so many bearings.
+# Views at all places: of the lines that are widest from there, in so many bearings.
 VIEW_LINE_COUNT, BEARING_COUNT = 400, 180
+# All places are tried with the widest of them first.
+OUTLINE_LINE_COUNT = 100
 # The places lie between these quantiles of the map's length in each direction, and so far inside.
 BOX_QUANTILES = (0.02, 0.98)
 BOX_MARGIN_M = 0.2
@@ -55,7 +57,7 @@ class PreparedMap:
         places: (T, 3) m, places that are tried.
         step_m: spacing of the places.
         lines: those that have a class.
-        views: what these look like from the places.
+        outline, views: what few and what many of these look like from the places.
     """
 
     segments: FloatArray
@@ -66,18 +68,25 @@ class PreparedMap:
     places: FloatArray
     step_m: float
     lines: ClassedLines
+    outline: Views
     views: Views
 
     def __len__(self) -> int:
         return len(self.segments)
 
-    def longest(self, count: int) -> PreparedMap:
-        """The same with fewer lines to match."""
+    def widest(self, place: FloatArray, count: int) -> PreparedMap:
+        """The same with the lines alone that take up most of the view from a (3,) place, m."""
+        if count >= len(self):
+            return self
+        offset = self.segments.mean(axis=1) - place
+        away = offset - dot(offset, self.directions)[:, None] * self.directions
+        size = norm(self.segments[:, 1] - self.segments[:, 0]) * norm(away) / (offset**2).sum(axis=1)
+        chosen = np.argpartition(-size, count)[:count]
         return replace(
             self,
-            segments=self.segments[:count],
-            directions=self.directions[:count],
-            channel=self.channel[:count],
+            segments=self.segments[chosen],
+            directions=self.directions[chosen],
+            channel=self.channel[chosen],
         )
 
     def to_arrays(self) -> Arrays:
@@ -102,7 +111,7 @@ class PreparedMap:
         return PreparedMap(**values)
 
 
-_PARTS: dict[str, Any] = {"lines": ClassedLines, "views": Views}
+_PARTS: dict[str, Any] = {"lines": ClassedLines, "outline": Views, "views": Views}
 
 
 def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:
@@ -126,7 +135,8 @@ def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:
         places=places,
         step_m=step_m,
         lines=lines,
-        views=views_from(lines.longest(VIEW_LINE_COUNT), places, BEARING_COUNT),
+        outline=views_from(lines, places, BEARING_COUNT, OUTLINE_LINE_COUNT),
+        views=views_from(lines, places, BEARING_COUNT, VIEW_LINE_COUNT),
     )
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from roel_service.arrays import BoolArray, FloatArray, IntArray
-from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3, rotation_angle
+from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import refine_kernels
-from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
+from roel_service.pano_loc.coverage import GATE_RAD, WIDTH_RAD, LinePoints, covered, two_way_score
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.search import Candidates
 
@@ -19,17 +21,24 @@ MAX_SHIFT_M = 0.3
 MAX_TURN_RAD = np.deg2rad(8.0)
 DAMPING = 1e-3
 # Least squares: distance of samples, gate between arc and line, kernel width of each iteration.
-FINAL_STEP_RAD = np.deg2rad(2.0)
+FINAL_STEP_RAD = np.deg2rad(3.0)
 FINAL_GATE_RAD = np.deg2rad(5.0)
-FINAL_WIDTHS_RAD = np.deg2rad([0.7, 0.5, 0.5, 0.5])
+FINAL_WIDTHS_RAD = np.deg2rad([0.7] + [0.5] * 7)
+# Steps smaller than this, rad and m, are the last one.
+CONVERGED = 1e-4
 # The same for more of the modes, on fewer arcs.
 MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
 MODE_ARC_COUNT, MODE_LINE_COUNT, MODE_STEP_RAD = 200, 600, np.deg2rad(6.0)
-# Width of the kernel of a pose's score.
-SCORE_WIDTH_RAD = np.deg2rad(0.7)
-SCORE_GATE_RAD = np.deg2rad(6.0)
+# So many of them are made exact, told apart by points of about so many lines of all lengths.
+FINALIST_COUNT, WEIGHED_LINE_COUNT, WEIGHED_SPACING_M = 6, 800, 0.3
+# Lines near an arc are looked for once for each pose: while it is refined they move by less.
+FINAL_SLACK_RAD, MODE_SLACK_RAD = np.deg2rad(3.0), np.deg2rad(5.0)
 # Poses closer than this in both are one.
 SAME_POSE_M, SAME_POSE_RAD = 0.25, np.deg2rad(8.0)
+
+
+# Offsets (A + 1,) and indices of the lines near each arc.
+Nearby = tuple[IntArray, IntArray]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,13 +49,16 @@ class Samples:
         rays: (S, 3) unit, panorama frame; those of arc a are offsets[a]:offsets[a + 1].
         offsets: (A + 1,).
         weight: (S,) angle that each stands for, rad.
-        normals: (A, 3) of the arcs.
+        normals, middles: (A, 3) unit, of the arcs.
+        reach_rad: (A,) half their lengths.
     """
 
     rays: FloatArray
     offsets: IntArray
     weight: FloatArray
     normals: FloatArray
+    middles: FloatArray
+    reach_rad: FloatArray
 
 
 def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
@@ -61,22 +73,48 @@ def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
         rays=np.cos(turn_rad) * arcs.starts[arc] + np.sin(turn_rad) * aside[arc],
         offsets=offsets,
         weight=arcs.length_rad[arc] / counts[arc],
-        normals=np.ascontiguousarray(arcs.normals),
+        normals=arcs.normals,
+        middles=unit(arcs.starts + arcs.ends),
+        reach_rad=arcs.length_rad / 2,
     )
 
 
 def refine_poses(
-    candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, config: LocalizeConfig
+    candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap
 ) -> Candidates:
     """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
-    long = prepared.longest(MODE_LINE_COUNT)
-    modes = _refined(distinct(candidates, MODE_COUNT), few, long, MODE_WIDTHS_RAD)
-    samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    best = distinct(modes, config.max_hypothesis_count)
-    return distinct(
-        _refined(best, samples, prepared, FINAL_WIDTHS_RAD), config.max_hypothesis_count
+    modes = _refined(
+        distinct(candidates, MODE_COUNT),
+        few,
+        prepared,
+        MODE_WIDTHS_RAD,
+        MODE_SLACK_RAD,
+        MODE_LINE_COUNT,
     )
+    best = distinct(_weighed(modes, arcs, prepared), FINALIST_COUNT)
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
+    refined = _refined(
+        best, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared)
+    )
+    return distinct(refined, FINALIST_COUNT)
+
+
+def _weighed(modes: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Candidates:
+    """Modes scored in both directions: a map of many rooms explains much of any picture."""
+    if len(modes) <= FINALIST_COUNT:
+        return modes
+    stride = -(-len(prepared) // WEIGHED_LINE_COUNT)
+    lines = LinePoints.of(prepared.segments[::stride], WEIGHED_SPACING_M)
+
+    def score(index: int) -> float:
+        shown = covered(modes.poses[index], arcs, lines)
+        return two_way_score(float(modes.score[index]), shown)
+
+    with ThreadPoolExecutor(THREAD_COUNT) as threads:
+        return Candidates(
+            poses=modes.poses, score=np.array(list(threads.map(score, range(len(modes)))))
+        )
 
 
 def distinct(candidates: Candidates, max_count: int) -> Candidates:
@@ -95,22 +133,42 @@ def distinct(candidates: Candidates, max_count: int) -> Candidates:
 
 
 def _refined(
-    candidates: Candidates, samples: Samples, prepared: PreparedMap, widths_rad: FloatArray
+    candidates: Candidates,
+    samples: Samples,
+    prepared: PreparedMap,
+    widths_rad: FloatArray,
+    slack_rad: float,
+    line_count: int,
 ) -> Candidates:
-    """Each candidate after robust least squares over rotation and place."""
-    poses, scores = [], []
-    for index in range(len(candidates)):
-        pose = candidates.poses[index]
+    """Each candidate after robust least squares over rotation and place.
+
+    Args:
+        candidates: first poses.
+        samples: of the arcs.
+        prepared: the map.
+        widths_rad: of the kernel, in each iteration.
+        slack_rad: lines are looked for near arcs once, with so much to spare.
+        line_count: that take part, those that are widest from a pose.
+    """
+
+    def refined(pose: SE3) -> tuple[SE3, float]:
+        lines = prepared.widest(pose.translation, line_count)
+        nearby = lines_nearby(pose, samples, lines, slack_rad)
         for width_rad in widths_rad:
-            pose = pose.retract(_step(*equations(pose, samples, prepared, width_rad)))
-        poses.append(pose)
-        scores.append(explained(pose, samples, prepared))
+            step = _step(*equations(pose, samples, lines, nearby, width_rad))
+            pose = pose.retract(step)
+            if width_rad == widths_rad[-1] and np.linalg.norm(step) < CONVERGED:
+                break
+        return pose, explained(pose, samples, lines, nearby)
+
+    with ThreadPoolExecutor(THREAD_COUNT) as threads:
+        found = list(threads.map(refined, (candidates.poses[i] for i in range(len(candidates)))))
     return Candidates(
         poses=SE3(
-            rotation=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
-            translation=np.array([pose.translation for pose in poses]).reshape(-1, 3),
+            rotation=np.array([pose.rotation for pose, _ in found]).reshape(-1, 3, 3),
+            translation=np.array([pose.translation for pose, _ in found]).reshape(-1, 3),
         ),
-        score=np.array(scores),
+        score=np.array([score for _, score in found]),
     )
 
 
@@ -131,21 +189,38 @@ class Matches:
     residual: FloatArray
 
 
-def match(pose: SE3, samples: Samples, prepared: PreparedMap, max_angle_rad: float) -> Matches:
+def lines_nearby(
+    pose: SE3, samples: Samples, prepared: PreparedMap, slack_rad: float = 0.0
+) -> Nearby:
+    """Lines that rays of each arc may lie on at this pose, and at others that are close to it."""
+    return refine_kernels.nearby_lines(
+        samples.middles @ pose.rotation.T,
+        samples.reach_rad,
+        samples.normals @ pose.rotation.T,
+        prepared.directions,
+        refine_kernels.viewed_lines(prepared.segments, pose.translation),
+        GATE_RAD,
+        slack_rad,
+    )
+
+
+def match(
+    pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby, max_angle_rad: float
+) -> Matches:
     """The nearest line of each ray, among those that the arc may be."""
     rays, normals = samples.rays @ pose.rotation.T, samples.normals @ pose.rotation.T
     seen = refine_kernels.viewed_lines(prepared.segments, pose.translation)
     line, residual = refine_kernels.match_rays(
-        rays, samples.offsets, normals, prepared.directions, seen, max_angle_rad
+        rays, samples.offsets, normals, prepared.directions, seen, nearby, max_angle_rad
     )
     return Matches(rays=rays, seen=seen, line=line, residual=residual)
 
 
 def equations(
-    pose: SE3, samples: Samples, prepared: PreparedMap, width_rad: float
+    pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby, width_rad: float
 ) -> tuple[FloatArray, FloatArray]:
     """(6, 6) of the Gauss-Newton step at a pose, and (L, 6) gradient by line; tangent (r, d)."""
-    found = match(pose, samples, prepared, FINAL_GATE_RAD)
+    found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
     H, g = refine_kernels.normal_equations(
         found.rays,
         samples.weight,
@@ -158,10 +233,10 @@ def equations(
     return H, g
 
 
-def explained(pose: SE3, samples: Samples, prepared: PreparedMap) -> float:
+def explained(pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby) -> float:
     """Share of the arcs' length that lines of the map explain, 0 to 1."""
-    found = match(pose, samples, prepared, SCORE_GATE_RAD)
-    fit = np.where(found.line >= 0, np.exp(-0.5 * (found.residual / SCORE_WIDTH_RAD) ** 2), 0.0)
+    found = match(pose, samples, prepared, nearby, GATE_RAD)
+    fit = np.where(found.line >= 0, np.exp(-0.5 * (found.residual / WIDTH_RAD) ** 2), 0.0)
     return float(samples.weight @ fit / max(samples.weight.sum(), 1e-9))
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from roel_service.arrays import BoolArray, FloatArray, IntArray
+from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
 
 # Lines whose viewing plane is not defined, or closer to the centre than this, are left out, m.
 MIN_DISTANCE_M = 0.05
 # A ray belongs to a line's image up to this far beyond its ends.
-END_SLACK_SINE = np.sin(np.deg2rad(1.5))
+END_SLACK_RAD = np.deg2rad(1.5)
+END_SLACK_SINE = np.sin(END_SLACK_RAD)
 # Viewing planes of arc and line differ by no more than this, or the arc's own error if larger.
 MIN_NORMAL_GATE_RAD = np.deg2rad(15.0)
 
@@ -62,12 +63,97 @@ def viewed_lines(
 
 
 @numba.njit(cache=True, nogil=True)
+def _mark_alike(
+    arc_normal: Array,
+    middle: Array,
+    planes: Array,
+    ways: Array,
+    cosine: float,
+    sine: float,
+    aside_sine: float,
+    alike: BoolArray,
+) -> None:
+    """Mark lines whose viewing planes (3, L) and directions (3, L) agree with an arc's."""
+    nx, ny, nz = arc_normal
+    x, y, z = middle
+    for j in range(len(alike)):
+        plane = abs(nx * planes[0, j] + ny * planes[1, j] + nz * planes[2, j])
+        way = abs(nx * ways[0, j] + ny * ways[1, j] + nz * ways[2, j])
+        aside = abs(x * planes[0, j] + y * planes[1, j] + z * planes[2, j])
+        alike[j] = (plane >= cosine) & (way <= sine) & (aside <= aside_sine)
+
+
+@numba.njit(cache=True, nogil=True)
+def nearby_lines(
+    middles: FloatArray,
+    reach_rad: FloatArray,
+    normals: FloatArray,
+    directions: FloatArray,
+    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
+    max_angle_rad: float,
+    slack_rad: float,
+) -> tuple[IntArray, IntArray]:
+    """Lines that rays of an arc may lie on, also at poses that are a little off.
+
+    Args:
+        middles: (A, 3) unit, of the arcs, world.
+        reach_rad: (A,) half their lengths.
+        normals: (A, 3) unit, of the arcs, world.
+        directions: (L, 3) unit, of the lines.
+        seen: what `viewed_lines` found.
+        max_angle_rad: between arcs and lines, as `match_rays` has it.
+        slack_rad: how much more is allowed for other poses.
+
+    Returns:
+        (A + 1,) offsets; lines of arc a are lines[offsets[a]:offsets[a + 1]].
+    """
+    normal, _, from_start, to_end, sound = seen
+    offsets = np.zeros(len(normals) + 1, np.int64)
+    lines = np.empty(16 * len(normals) + 16, np.int64)
+    count = 0
+    sine = np.sin(max_angle_rad + slack_rad)
+    cosine = np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD) + slack_rad)
+    # By coordinate and short, so that one instruction takes several lines.
+    planes = np.ascontiguousarray(normal.T.astype(np.float32))
+    ways = np.ascontiguousarray(directions.T.astype(np.float32))
+    alike = np.empty(len(directions), np.bool_)
+    for a in range(len(normals)):
+        aside = np.sin(min(reach_rad[a] + max_angle_rad + slack_rad, np.pi / 2))
+        _mark_alike(
+            normals[a].astype(np.float32),
+            middles[a].astype(np.float32),
+            planes,
+            ways,
+            np.float32(cosine),
+            np.float32(sine),
+            np.float32(aside),
+            alike,
+        )
+        x, y, z = middles[a]
+        beyond = -np.sin(min(reach_rad[a] + END_SLACK_RAD + slack_rad, np.pi / 2))
+        for j in range(len(directions)):
+            if not (alike[j] and sound[j]):
+                continue
+            if x * from_start[j, 0] + y * from_start[j, 1] + z * from_start[j, 2] < beyond:
+                continue
+            if x * to_end[j, 0] + y * to_end[j, 1] + z * to_end[j, 2] < beyond:
+                continue
+            if count == len(lines):
+                lines = np.concatenate((lines, np.empty_like(lines)))
+            lines[count] = j
+            count += 1
+        offsets[a + 1] = count
+    return offsets, lines[:count]
+
+
+@numba.njit(cache=True, nogil=True)
 def match_rays(
     rays: FloatArray,
     offsets: IntArray,
     normals: FloatArray,
     directions: FloatArray,
     seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
+    nearby: tuple[IntArray, IntArray],
     max_angle_rad: float,
 ) -> tuple[IntArray, FloatArray]:
     """(S,) line that each ray of an arc lies nearest to, -1 for none; (S,) sine of the angle.
@@ -81,17 +167,19 @@ def match_rays(
         normals: (A, 3) unit, of the arcs, world.
         directions: (L, 3) unit, of the lines.
         seen: what `viewed_lines` found.
+        nearby: what `nearby_lines` found: the lines that are asked.
         max_angle_rad: between arcs and lines.
     """
     normal, _, from_start, to_end, sound = seen
+    first, near = nearby
     line = np.full(len(rays), -1, np.int64)
     residual = np.zeros(len(rays))
     sine = np.sin(max_angle_rad)
     cosine = np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD))
     for a in range(len(normals)):
-        nx, ny, nz = normals[a]
-        for j in range(len(directions)):
-            # In scalars, and the test that most lines fail first.
+        nx, ny, nz = normals[a, 0], normals[a, 1], normals[a, 2]
+        for index in range(first[a], first[a + 1]):
+            j = near[index]
             mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
             if abs(nx * mx + ny * my + nz * mz) < cosine or not sound[j]:
                 continue
@@ -155,8 +243,22 @@ def jacobian(
 
 
 @numba.njit(cache=True, nogil=True)
+def _mark_passing(
+    direction: Array, middle: Array, normals: Array, sine: float, reach_sine: float, near: BoolArray
+) -> None:
+    """Mark arcs of (3, A) normals that have a line's direction and pass by its middle."""
+    dx, dy, dz = direction
+    x, y, z = middle
+    for a in range(len(near)):
+        off = abs(dx * normals[0, a] + dy * normals[1, a] + dz * normals[2, a])
+        aside = abs(x * normals[0, a] + y * normals[1, a] + z * normals[2, a])
+        near[a] = (off <= sine) & (aside <= reach_sine)
+
+
+@numba.njit(cache=True, nogil=True)
 def match_points(
     points: FloatArray,
+    offsets: IntArray,
     directions: FloatArray,
     normals: FloatArray,
     from_start: FloatArray,
@@ -168,25 +270,46 @@ def match_points(
     Infinite where no arc passes.
 
     Args:
-        points: (P, 3) unit rays to points of lines, panorama frame.
-        directions: (P, 3) unit, of the lines, panorama frame.
+        points: (P, 3) unit rays, panorama frame; those of line j are offsets[j]:offsets[j + 1].
+        offsets: (L + 1,).
+        directions: (L, 3) unit, of the lines, panorama frame.
         normals: (A, 3) unit, of the arcs.
         from_start, to_end: (A, 3) unit, normal x start and end x normal.
         max_angle_rad: gate.
     """
     nearest = np.full(len(points), np.inf)
     sine = np.sin(max_angle_rad)
-    for p in range(len(points)):
-        x, y, z = points[p]
-        dx, dy, dz = directions[p]
-        least = sine
+    # By coordinate and short, so that one instruction takes several arcs.
+    columns = np.ascontiguousarray(normals.T.astype(np.float32))
+    near, alike = np.empty(len(normals), np.bool_), np.empty(len(normals), np.int64)
+    for j in range(len(directions)):
+        first, last = offsets[j], offsets[j + 1]
+        middle = points[(first + last) // 2]
+        reach = min(_dot(middle, points[first]), _dot(middle, points[last - 1]))
+        reach_rad = np.arccos(max(-1.0, min(1.0, reach))) + max_angle_rad
+        _mark_passing(
+            directions[j].astype(np.float32),
+            middle.astype(np.float32),
+            columns,
+            np.float32(sine),
+            np.float32(np.sin(min(reach_rad, np.pi / 2))),
+            near,
+        )
+        count = 0
         for a in range(len(normals)):
-            nx, ny, nz = normals[a, 0], normals[a, 1], normals[a, 2]
-            off = abs(x * nx + y * ny + z * nz)
-            if off > least or abs(dx * nx + dy * ny + dz * nz) > sine:
-                continue
-            ahead = x * from_start[a, 0] + y * from_start[a, 1] + z * from_start[a, 2]
-            behind = x * to_end[a, 0] + y * to_end[a, 1] + z * to_end[a, 2]
-            if min(ahead, behind) >= -END_SLACK_SINE:
-                least, nearest[p] = off, np.arcsin(off)
+            if near[a]:
+                alike[count] = a
+                count += 1
+        for p in range(first, last):
+            x, y, z = points[p, 0], points[p, 1], points[p, 2]
+            least = sine
+            for index in range(count):
+                a = alike[index]
+                off = abs(x * normals[a, 0] + y * normals[a, 1] + z * normals[a, 2])
+                if off > least:
+                    continue
+                ahead = x * from_start[a, 0] + y * from_start[a, 1] + z * from_start[a, 2]
+                behind = x * to_end[a, 0] + y * to_end[a, 1] + z * to_end[a, 2]
+                if min(ahead, behind) >= -END_SLACK_SINE:
+                    least, nearest[p] = off, np.arcsin(off)
     return nearest

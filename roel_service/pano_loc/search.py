@@ -11,11 +11,16 @@ from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
 from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.hints import PosePrior
-from roel_service.pano_loc.prepare import BEARING_COUNT, PreparedMap
-from roel_service.pano_loc.views import agreement, pane_of, views_from, widest
+from roel_service.pano_loc.prepare import BEARING_COUNT, VIEW_LINE_COUNT, PreparedMap
+from roel_service.pano_loc.views import Pane, agreement, pane_of, views_around, views_from
 
 # Places within reach of a prior are tried at this spacing, and so much fewer candidates stay.
 PRIOR_STEP_M, PRIOR_CANDIDATE_SHARE = 0.25, 1 / 3
+# Maps of more places, which hold many rooms, have more candidates in proportion.
+ROOM_PLACE_COUNT = 4000
+# In each orientation and by each ranking these places stay after the widest lines: a share, and no
+# fewer than so many.
+OUTLINED_SHARE, MIN_OUTLINED_COUNT = 0.06, 150
 # Places of one orientation, so far apart.
 PLACES_PER_ROTATION = 6
 SUPPRESSION_M = 0.5
@@ -95,16 +100,15 @@ def coarse_candidates(
     Everything is ranked twice: where all lines can be seen, and where walls hide most of them. With
     a prior, places within its reach are tried.
     """
-    places, step_m, views = prepared.places, prepared.step_m, prepared.views
     candidate_count = config.candidate_count / len(RANKINGS)
-    if prior is not None:
+    if prior is None:
+        step_m = prepared.step_m
+        candidate_count *= max(1.0, len(prepared.places) / ROOM_PLACE_COUNT)
+        places, scores = _everywhere(arcs, prepared, rotations)
+    else:
         step_m = PRIOR_STEP_M
         candidate_count *= PRIOR_CANDIDATE_SHARE
-        places = _ball(prior.reach_m, step_m) + prior.T_world_picture.translation
-        views = views_from(prepared.lines, places, BEARING_COUNT)
-    frames = prepared.lines.frames
-    panes = [pane_of(arcs, rotation, frames, step_m, BEARING_COUNT) for rotation in rotations]
-    scores = agreement(views, panes)
+        places, scores = _within_reach(arcs, prepared, rotations, prior)
     found = []
     for kind in RANKINGS:
         seeds = _best_of_all(places, scores[:, :, kind])
@@ -120,6 +124,35 @@ def coarse_candidates(
     return Candidates(poses=poses, score=np.concatenate([_ranks(seeds.score) for seeds in found]))
 
 
+def _everywhere(
+    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(R, C, 3) places that agree best with the widest lines, and their (R, C, 2) `agreement`."""
+    panes = _panes(arcs, prepared, rotations, prepared.step_m)
+    outline = agreement(prepared.outline, panes)
+    count = max(MIN_OUTLINED_COUNT, round(OUTLINED_SHARE * len(prepared.places)))
+    count = min(count, len(prepared.places))
+    chosen = np.argpartition(-outline, count - 1, axis=1)[:, :count].reshape(len(panes), -1)
+    return prepared.places[chosen], agreement(prepared.views, panes, chosen)
+
+
+def _within_reach(
+    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray, prior: PosePrior
+) -> tuple[FloatArray, FloatArray]:
+    """(R, C, 3) places near a first one, and their (R, C, 2) `agreement`."""
+    places = _ball(prior.reach_m, PRIOR_STEP_M) + prior.T_world_picture.translation
+    views = views_from(prepared.lines, places, BEARING_COUNT, VIEW_LINE_COUNT)
+    scores = agreement(views, _panes(arcs, prepared, rotations, PRIOR_STEP_M))
+    return np.broadcast_to(places, (len(rotations), *places.shape)), scores
+
+
+def _panes(
+    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray, step_m: float
+) -> list[Pane]:
+    frames = prepared.lines.frames
+    return [pane_of(arcs, rotation, frames, step_m, BEARING_COUNT) for rotation in rotations]
+
+
 def _ranks(score: FloatArray) -> FloatArray:
     """1 for the best, less for the others: makes the two scores comparable."""
     rank = np.empty(len(score))
@@ -128,11 +161,13 @@ def _ranks(score: FloatArray) -> FloatArray:
 
 
 def _best_of_all(places: FloatArray, scores: FloatArray) -> _Seeds:
-    """The best places for each orientation, from (R, T) scores."""
-    chosen = [_best_apart(places, score) for score in scores]
+    """The best places for each orientation, from (R, C, 3) places and (R, C) scores."""
+    chosen = [_best_apart(*item) for item in zip(places, scores, strict=True)]
     rotation = np.repeat(np.arange(len(scores)), [len(item) for item in chosen])
     place = np.concatenate([np.array(item, dtype=np.int64) for item in chosen])
-    return _Seeds(rotation=rotation, places=places[place], score=scores[rotation, place])
+    return _Seeds(
+        rotation=rotation, places=places[rotation, place], score=scores[rotation, place]
+    )
 
 
 def _best_apart(places: FloatArray, score: FloatArray) -> list[int]:
@@ -161,8 +196,9 @@ def _moved(
     for index in np.unique(seeds.rotation):
         pane = pane_of(arcs, rotations[index], prepared.lines.frames, step_m, FINE_BEARING_COUNT)
         for member in np.flatnonzero(seeds.rotation == index):
-            lines = widest(prepared.lines, places[member], FINE_LINE_COUNT)
-            views = views_from(lines, places[member] + around, FINE_BEARING_COUNT)
+            views = views_around(
+                prepared.lines, places[member] + around, FINE_BEARING_COUNT, FINE_LINE_COUNT
+            )
             score = agreement(views, [pane])[0, :, kind]
             best = int(score.argmax())
             places[member] += around[best]

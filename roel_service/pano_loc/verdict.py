@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,19 +11,15 @@ import numpy as np
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3, rotation_angle
-from roel_service.geometry.segments import sample_segments
-from roel_service.geometry.vectors import dot, norm
-from roel_service.pano_loc import refine_kernels
-from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
+from roel_service.pano_loc.coverage import LinePoints, covered, two_way_score
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import (
     FINAL_STEP_RAD,
     FINAL_WIDTHS_RAD,
-    SCORE_GATE_RAD,
-    SCORE_WIDTH_RAD,
     Samples,
     equations,
-    explained,
+    lines_nearby,
     sample_arcs,
 )
 from roel_service.pano_loc.search import Candidates
@@ -42,8 +39,6 @@ MIN_LINE_COUNT = 12
 SAME_ANSWER_M, SAME_ANSWER_RAD = 0.3, np.deg2rad(15.0)
 # Along a direction that is less certain than this there is no answer.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.3, np.deg2rad(15.0)
-# Map lines may be hidden: their share counts half.
-COVERAGE_WEIGHT = 0.5
 POINT_SPACING_M = 0.1
 # A pose that stands out needs less of a score: where walls hide most of a map, scores are low.
 MARGIN_WEIGHT = 0.2
@@ -83,12 +78,15 @@ def enough_lines(prepared: PreparedMap) -> bool:
 def hypotheses(
     candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, map_index: int
 ) -> tuple[PoseHypothesis, ...]:
-    """The candidates, weighed in both directions."""
-    samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    return tuple(
-        _hypothesis(candidates.poses[index], arcs, samples, prepared, map_index)
-        for index in range(len(candidates))
-    )
+    """The candidates, weighed in both directions; their scores are the shares of arcs explained."""
+    samples, lines = sample_arcs(arcs, FINAL_STEP_RAD), LinePoints.of(prepared.segments, POINT_SPACING_M)
+
+    def weighed(index: int) -> PoseHypothesis:
+        pose, explained_2d = candidates.poses[index], float(candidates.score[index])
+        return _hypothesis(pose, explained_2d, arcs, samples, lines, prepared, map_index)
+
+    with ThreadPoolExecutor(THREAD_COUNT) as threads:
+        return tuple(threads.map(weighed, range(len(candidates))))
 
 
 def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig) -> PanoLocResult:
@@ -156,14 +154,18 @@ def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
 
 
 def _hypothesis(
-    pose: SE3, arcs: PanoramaArcs, samples: Samples, prepared: PreparedMap, map_index: int
+    pose: SE3,
+    explained_2d: float,
+    arcs: PanoramaArcs,
+    samples: Samples,
+    lines: LinePoints,
+    prepared: PreparedMap,
+    map_index: int,
 ) -> PoseHypothesis:
-    explained_2d = explained(pose, samples, prepared)
-    explained_3d = covered(pose, arcs, prepared)
-    score = (explained_2d + COVERAGE_WEIGHT * explained_3d) / (1.0 + COVERAGE_WEIGHT)
+    explained_3d = covered(pose, arcs, lines)
     return PoseHypothesis(
         T_world_panorama=pose,
-        score=score,
+        score=two_way_score(explained_2d, explained_3d),
         covariance=_covariance(pose, samples, prepared),
         explained_2d=explained_2d,
         explained_3d=explained_3d,
@@ -171,34 +173,13 @@ def _hypothesis(
     )
 
 
-def covered(pose: SE3, arcs: PanoramaArcs, prepared: PreparedMap) -> float:
-    """Share of the map's lines, by the angle that they take up, on which an arc lies; 0 to 1."""
-    points, line = sample_segments(prepared.segments, POINT_SPACING_M)
-    directions = prepared.directions[line]
-    offset = points - pose.translation
-    distance_m = np.maximum(norm(offset), refine_kernels.MIN_DISTANCE_M)
-    rays = offset / distance_m[:, None]
-    angle_rad = refine_kernels.match_points(
-        rays @ pose.rotation,
-        directions @ pose.rotation,
-        arcs.normals,
-        np.cross(arcs.normals, arcs.starts),
-        np.cross(arcs.ends, arcs.normals),
-        SCORE_GATE_RAD,
-    )
-    along = dot(rays, directions)
-    shown = ((rays @ pose.rotation) @ arcs.sides.T > 0.0).all(axis=1)
-    weight = shown * np.sqrt(np.maximum(0.0, 1.0 - along**2)) / distance_m
-    fit = np.exp(-0.5 * (np.minimum(angle_rad, 1.0) / SCORE_WIDTH_RAD) ** 2)
-    return float(weight @ fit / max(weight.sum(), 1e-9))
-
-
 def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap) -> FloatArray:
     """(6, 6) of (r, d): what the residuals of whole lines say about each other's pull.
 
     All samples of a line err together, and lines err independently.
     """
-    H, gradients = equations(pose, samples, prepared, FINAL_WIDTHS_RAD[-1])
+    nearby = lines_nearby(pose, samples, prepared)
+    H, gradients = equations(pose, samples, prepared, nearby, FINAL_WIDTHS_RAD[-1])
     inverse = np.linalg.inv(H + WEAKEST * np.eye(6))
     pull = gradients.T @ gradients
     line_count = int(np.count_nonzero(gradients.any(axis=1)))

@@ -23,6 +23,8 @@ MIN_SHARE = 0.03
 CLASS_SINE = np.sin(np.deg2rad(4.0))
 # Directions of arcs and of map lines are off by so much.
 DIRECTION_SLACK_RAD = np.deg2rad(1.0)
+# Places of which all lines are compared at once.
+CHUNK_PLACE_COUNT = 256
 # At this distance a picture is painted wide enough for a quarter of a cell of places.
 SLACK_DISTANCE_M = 1.0
 
@@ -40,9 +42,6 @@ class ClassedLines:
     frames: FloatArray
     which: IntArray
     feet: FloatArray
-
-    def longest(self, count: int) -> ClassedLines:
-        return ClassedLines(frames=self.frames, which=self.which[:count], feet=self.feet[:count])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,11 +84,54 @@ def classed_lines(segments: FloatArray, channel: IntArray, frames: FloatArray) -
     return ClassedLines(frames=frames, which=which, feet=np.ascontiguousarray(feet))
 
 
-def views_from(lines: ClassedLines, places: FloatArray, bearing_count: int) -> Views:
-    """What lines look like from (T, 3) places, m."""
-    inside = np.ascontiguousarray(np.einsum("kij,tj->tki", lines.frames, places))
+def views_from(
+    lines: ClassedLines, places: FloatArray, bearing_count: int, line_count: int
+) -> Views:
+    """What lines look like from (T, 3) places, m: from each, those that take up most of its sphere.
+
+    Lines of other rooms are far, and take up little.
+    """
+    inside = _inside(lines, places)
+    chosen = np.concatenate(
+        [
+            widest(lines, inside[first : first + CHUNK_PLACE_COUNT], line_count)
+            for first in range(0, len(places), CHUNK_PLACE_COUNT)
+        ]
+        or [np.empty((0, line_count), np.int64)]
+    )
+    return _views_of(lines, inside, chosen, bearing_count)
+
+
+def views_around(
+    lines: ClassedLines, places: FloatArray, bearing_count: int, line_count: int
+) -> Views:
+    """The same from (T, 3) places around one, whose lines they share."""
+    inside = _inside(lines, places)
+    middle = inside.mean(axis=0, keepdims=True)
+    chosen = np.repeat(widest(lines, middle, line_count), len(places), axis=0)
+    return _views_of(lines, inside, chosen, bearing_count)
+
+
+def _inside(lines: ClassedLines, places: FloatArray) -> FloatArray:
+    """(T, K, 3) places in the axes of each class."""
+    return np.ascontiguousarray(np.einsum("kij,tj->tki", lines.frames, places))
+
+
+def widest(lines: ClassedLines, inside: FloatArray, count: int) -> IntArray:
+    """(T, C) lines that take up most of the sphere, seen from (T, K, 3) places, widest first."""
+    span_rad = views_kernels.spans(lines.feet, lines.which, inside)
+    count = min(count, span_rad.shape[1])
+    chosen = np.argpartition(-span_rad, max(count - 1, 0), axis=1)[:, :count]
+    order = np.argsort(-np.take_along_axis(span_rad, chosen, axis=1), axis=1, kind="stable")
+    return np.asarray(np.take_along_axis(chosen, order, axis=1))
+
+
+def _views_of(
+    lines: ClassedLines, inside: FloatArray, chosen: IntArray, bearing_count: int
+) -> Views:
+    """What (T, M) chosen lines look like from (T, K, 3) places."""
     slots, words, kinds = views_kernels.views(
-        lines.feet, lines.which, inside, bearing_count, SHELL_ENDS_M
+        lines.feet, lines.which, inside, chosen, bearing_count, SHELL_ENDS_M
     )
     everything = np.full(len(lines.frames) * bearing_count, ~np.uint64(0))
     sizes = _sizes(slots, words, kinds, everything, len(lines.frames))
@@ -99,16 +141,6 @@ def views_from(lines: ClassedLines, places: FloatArray, bearing_count: int) -> V
 def _sizes(slots: Array, words: Array, kinds: Array, shown: Array, class_count: int) -> FloatArray:
     kind_count = class_count * len(SHELL_MIDDLES_M)
     return np.asarray(views_kernels.sizes(slots, words, kinds, shown, kind_count))
-
-
-def widest(lines: ClassedLines, place: FloatArray, count: int) -> ClassedLines:
-    """The lines that take up most of the sphere, seen from a (3,) place, m."""
-    if len(lines.feet) <= count:
-        return lines
-    inside = np.ascontiguousarray(lines.frames @ place)
-    span_rad = views_kernels.spans(lines.feet, lines.which, inside)
-    chosen = np.argpartition(-span_rad, count)[:count]
-    return ClassedLines(frames=lines.frames, which=lines.which[chosen], feet=lines.feet[chosen])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,21 +192,34 @@ def pane_of(
     )
 
 
-def agreement(views: Views, panes: Sequence[Pane]) -> FloatArray:
-    """(R, T, 2) scores of places in R orientations: beyond chance, and by likelihood.
+def agreement(
+    views: Views, panes: Sequence[Pane], chosen: IntArray | None = None
+) -> FloatArray:
+    """(R, C, 2) scores of places in R orientations: beyond chance, and by likelihood.
 
     The first is right where all lines can be seen, the second where walls hide most of them.
+
+    Args:
+        views: of T places.
+        panes: of R orientations.
+        chosen: (R, C) places that are asked for in each orientation; None for all.
     """
+    if chosen is None:
+        chosen = np.broadcast_to(np.arange(len(views.words)), (len(panes), len(views.words)))
     share, gain, loss = (
         np.stack([getattr(pane, name) for pane in panes]) for name in ("share", "gain", "loss")
     )
     words = np.stack([pane.words.ravel() for pane in panes])
-    total = views_kernels.painted_steps(views.slots, views.words, views.kinds, words, gain - loss)
-    sizes = np.stack([_sizes_in(views, pane) for pane in panes])
-    size = np.maximum(sizes.sum(axis=2), 1.0)
-    excess = (total[:, :, 0] - np.einsum("rn,rtn->rt", share, sizes)) / np.sqrt(size)
-    ratio = total[:, :, 1] + np.einsum("rn,rtn->rt", loss, sizes)
-    return np.stack([excess, ratio], axis=2)
+    total = views_kernels.painted_steps(
+        views.slots, views.words, views.kinds, words, gain - loss, np.ascontiguousarray(chosen)
+    )
+    sizes = [_sizes_in(views, pane)[places] for pane, places in zip(panes, chosen, strict=True)]
+    expected = np.stack([size @ column for size, column in zip(sizes, share, strict=True)])
+    missed = np.stack([size @ column for size, column in zip(sizes, loss, strict=True)])
+    size = np.maximum(np.stack([size.sum(axis=1) for size in sizes]), 1.0)
+    return np.stack(
+        [(total[:, :, 0] - expected) / np.sqrt(size), total[:, :, 1] + missed], axis=2
+    )
 
 
 def _sizes_in(views: Views, pane: Pane) -> FloatArray:

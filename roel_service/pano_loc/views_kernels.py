@@ -70,15 +70,16 @@ def _bearing(across: float, aside: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def spans(feet: FloatArray, which: IntArray, place: FloatArray) -> FloatArray:
-    """(L,) angles that lines take up, seen from a (K, 3) place in the axes of each class."""
-    span_rad = np.empty(len(feet))
-    for j in range(len(feet)):
-        k = which[j]
-        across, aside = feet[j, 0] - place[k, 0], feet[j, 1] - place[k, 1]
-        away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
-        low, high = (feet[j, 2] - place[k, 2]) / away, (feet[j, 3] - place[k, 2]) / away
-        span_rad[j] = _arctan(high) - _arctan(low)
+def spans(feet: FloatArray, which: IntArray, places: FloatArray) -> FloatArray:
+    """(T, L) angles that lines take up, seen from (T, K, 3) places in the axes of each class."""
+    span_rad = np.empty((len(places), len(feet)))
+    for t in range(len(places)):
+        for j in range(len(feet)):
+            k = which[j]
+            across, aside = feet[j, 0] - places[t, k, 0], feet[j, 1] - places[t, k, 1]
+            away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
+            low, high = (feet[j, 2] - places[t, k, 2]) / away, (feet[j, 3] - places[t, k, 2]) / away
+            span_rad[t, j] = _arctan(high) - _arctan(low)
     return span_rad
 
 
@@ -87,16 +88,18 @@ def views(
     feet: FloatArray,
     which: IntArray,
     places: FloatArray,
+    chosen: IntArray,
     bearing_count: int,
     shell_ends_m: FloatArray,
 ) -> tuple[Array, Array, Array]:
     """Lines as seen from places.
 
     Args:
-        feet: (M, 4) of each line in the axes of its class: across, across, least and greatest
+        feet: (L, 4) of each line in the axes of its class: across, across, least and greatest
             along, m.
-        which: (M,) class of each line.
+        which: (L,) class of each line.
         places: (T, K, 3) in the axes of each class, m.
+        chosen: (T, M) lines that are looked at from each place.
         bearing_count: B.
         shell_ends_m: (S - 1,) distances that part the shells.
 
@@ -104,27 +107,28 @@ def views(
         (T, M) int32 slots: class and bearing as class B + bearing; (T, M) uint64 elevations; and
         (T, M) uint8 kinds: class and shell of the nearest point as class S + shell.
     """
-    slots = np.empty((len(places), len(feet)), np.int32)
-    words = np.empty((len(places), len(feet)), np.uint64)
-    kinds = np.empty((len(places), len(feet)), np.uint8)
+    slots = np.empty(chosen.shape, np.int32)
+    words = np.empty(chosen.shape, np.uint64)
+    kinds = np.empty(chosen.shape, np.uint8)
     per_rad, shell_count = bearing_count / (2.0 * np.pi), len(shell_ends_m) + 1
     for t in range(len(places)):
-        for j in range(len(feet)):
+        for m in range(chosen.shape[1]):
+            j = chosen[t, m]
             k = which[j]
             across, aside = feet[j, 0] - places[t, k, 0], feet[j, 1] - places[t, k, 1]
             low, high = feet[j, 2] - places[t, k, 2], feet[j, 3] - places[t, k, 2]
             away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
-            words[t, j] = _word(
+            words[t, m] = _word(
                 _arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD
             )
             bearing = int(_bearing(across, aside) * per_rad)
-            slots[t, j] = k * bearing_count + min(bearing, bearing_count - 1)
+            slots[t, m] = k * bearing_count + min(bearing, bearing_count - 1)
             ahead = max(0.0, low, -high)
             distance_m = np.sqrt(away * away + ahead * ahead)
             shell = 0
             while shell < shell_count - 1 and distance_m > shell_ends_m[shell]:
                 shell += 1
-            kinds[t, j] = k * shell_count + shell
+            kinds[t, m] = k * shell_count + shell
     return slots, words, kinds
 
 
@@ -230,18 +234,20 @@ def painted_share(pane: Array, shown: Array) -> FloatArray:
 
 @numba.njit(cache=True, nogil=True)
 def painted_steps(
-    slots: Array, words: Array, kinds: Array, panes: Array, gains: FloatArray
+    slots: Array, words: Array, kinds: Array, panes: Array, gains: FloatArray, chosen: IntArray
 ) -> FloatArray:
-    """(R, T, 2) steps of lines that are painted, and what they gain.
+    """(R, C, 2) steps of lines that are painted, and what they gain.
 
     Args:
         slots, words, kinds: (T, M) of `views`.
         panes: (R, K B).
         gains: (R, N) of a step of each kind.
+        chosen: (R, C) places that are asked for in each orientation.
     """
-    total = np.zeros((len(panes), len(slots), 2))
-    for t in range(len(slots)):
+    total = np.zeros((len(panes), chosen.shape[1], 2))
+    for c in range(chosen.shape[1]):
         for r in range(len(panes)):
+            t = chosen[r, c]
             steps, gained = 0.0, 0.0
             for j in range(slots.shape[1]):
                 both = words[t, j] & panes[r, slots[t, j]]
@@ -249,5 +255,5 @@ def painted_steps(
                     painted = np.float64(_count(both))
                     steps += painted
                     gained += gains[r, kinds[t, j]] * painted
-            total[r, t, 0], total[r, t, 1] = steps, gained
+            total[r, c, 0], total[r, c, 1] = steps, gained
     return total

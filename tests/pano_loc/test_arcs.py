@@ -5,7 +5,7 @@ from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry import sphere
 from roel_service.geometry.se3 import rotation_from_vector
 from roel_service.geometry.vectors import unit
-from roel_service.pano_loc.arcs import PanoramaArcs, crops, detect_arcs, join_arcs
+from roel_service.pano_loc.arcs import TILING, PanoramaArcs, crops, detect_arcs, join_arcs
 
 WIDTH = 1024
 # Corners of a window in front of the viewer, in order; and the same elsewhere.
@@ -82,7 +82,7 @@ def test_a_gap_parts_two_lines_on_one_circle():
 def test_crops_cover_the_sphere():
     rays = unit(np.random.default_rng(0).normal(size=(2000, 3)))
     seen = np.zeros(len(rays), bool)
-    for crop in crops(WIDTH, 64):
+    for crop in crops(WIDTH, 64, TILING):
         x, y, z = (rays @ crop.R_panorama_camera).T
         with np.errstate(divide="ignore", invalid="ignore"):
             place = crop.center_px + crop.focal_px * np.stack([x / z, y / z])

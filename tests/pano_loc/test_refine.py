@@ -8,10 +8,12 @@ from roel_service.pano_loc import refine_kernels
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.pano_loc.refine import (
     FINAL_GATE_RAD,
+    FINAL_SLACK_RAD,
     FINAL_WIDTHS_RAD,
     _refined,
     distinct,
     explained,
+    lines_nearby,
     match,
     sample_arcs,
 )
@@ -51,11 +53,12 @@ def test_the_jacobian_is_the_derivative_of_the_residual(near):
 def test_rays_find_their_lines_at_the_true_pose(prepared):
     T = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
     samples = sample_arcs(seen_from(T, segments_of()), 0.05)
-    found = match(T, samples, prepared, FINAL_GATE_RAD)
+    nearby = lines_nearby(T, samples, prepared)
+    found = match(T, samples, prepared, nearby, FINAL_GATE_RAD)
     # Lines that pass so close to the viewer that they have no image are left out.
     assert (found.line >= 0).mean() > 0.95
     assert np.abs(found.residual).max() < 1e-9
-    assert explained(T, samples, prepared) > 0.97
+    assert explained(T, samples, prepared, nearby) > 0.97
 
 
 def test_refinement_finds_the_exact_pose_from_near_by(prepared):
@@ -66,7 +69,7 @@ def test_refinement_finds_the_exact_pose_from_near_by(prepared):
         poses=SE3(rotation=start.rotation[None], translation=start.translation[None]),
         score=np.zeros(1),
     )
-    found = _refined(guess, samples, prepared, FINAL_WIDTHS_RAD)
+    found = _refined(guess, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared))
     # Convergence of a few steps: a tenth of a millimetre and of a milliradian.
     np.testing.assert_allclose(T.local(found.poses[0]), np.zeros(6), atol=1e-4)
 

@@ -13,7 +13,7 @@ from roel_service.pano_loc.views import (
 )
 from tests.pano_loc.rooms import pose, seen_from, segments_of
 
-BEARING_COUNT = 360
+BEARING_COUNT, LINE_COUNT = 360, 1000
 TRUTH = pose(1.7, 1.5, 1.4, 0.1, -0.2, 0.7)
 
 
@@ -41,7 +41,7 @@ def test_frames_of_classes_are_rotations_that_end_in_the_direction():
 def test_an_upright_line_has_one_bearing_and_a_stretch_of_elevations():
     frames = class_frames(np.array([[0.0, 0.0, 1.0]]), np.eye(3))
     line = classed_lines(np.array([[[1.0, 1.0, 0.0], [1.0, 1.0, 2.0]]]), np.zeros(1, int), frames)
-    views = views_from(line, np.array([[0.0, 0.0, 1.0], [1.0, 1.0 - 2.5, -3.0]]), BEARING_COUNT)
+    views = views_from(line, np.array([[0.0, 0.0, 1.0], [1.0, 1.0 - 2.5, -3.0]]), BEARING_COUNT, 1)
     x, y = frames[0, :2] @ [1.0, 1.0, 0.0]
     bearing_deg = np.degrees(np.arctan2(y, x)) % 360.0
     assert abs(views.slots[0, 0] + 0.5 - bearing_deg) <= 0.51
@@ -59,13 +59,15 @@ def test_the_fast_angles_are_angles(lines):
     feet = rng.normal(size=(500, 4))
     feet[:, 3] = feet[:, 2] + np.abs(feet[:, 3])
     which = np.zeros(500, np.int64)
-    slots, _, _ = views_kernels.views(feet, which, np.zeros((1, 1, 3)), 10**6, np.array([1.0]))
+    slots, _, _ = views_kernels.views(
+        feet, which, np.zeros((1, 1, 3)), np.arange(500)[None], 10**6, np.array([1.0])
+    )
     expected = np.arctan2(feet[:, 1], feet[:, 0]) % (2 * np.pi)
     np.testing.assert_allclose((slots[0] + 0.5) * (2 * np.pi / 10**6), expected, atol=3e-5)
     away = np.hypot(feet[:, 0], feet[:, 1])
     expected = np.arctan(feet[:, 3] / away) - np.arctan(feet[:, 2] / away)
     np.testing.assert_allclose(
-        views_kernels.spans(feet, which, np.zeros((1, 3))), expected, atol=3e-5
+        views_kernels.spans(feet, which, np.zeros((1, 1, 3)))[0], expected, atol=3e-5
     )
 
 
@@ -75,7 +77,9 @@ def test_the_true_place_and_orientation_agree_best(lines):
     rng = np.random.default_rng(0)
     others = rng.uniform([0.3, 0.3, 0.3], [3.7, 2.9, 2.2], (200, 3))
     others = others[np.linalg.norm(others - TRUTH.translation, axis=1) > 0.3]
-    views = views_from(lines, np.concatenate([TRUTH.translation[None], others]), BEARING_COUNT)
+    views = views_from(
+        lines, np.concatenate([TRUTH.translation[None], others]), BEARING_COUNT, LINE_COUNT
+    )
     panes = [
         pane_of(arcs, rotation, lines.frames, 0.1, BEARING_COUNT)
         for rotation in (TRUTH.rotation, half_turn)
@@ -89,15 +93,13 @@ def test_the_true_place_and_orientation_agree_best(lines):
 def test_without_arcs_nothing_agrees(lines):
     arcs = seen_from(TRUTH, segments_of()).take(np.arange(0))
     pane = pane_of(arcs, TRUTH.rotation, lines.frames, 0.1, BEARING_COUNT)
-    score = agreement(views_from(lines, TRUTH.translation[None], BEARING_COUNT), [pane])
+    score = agreement(views_from(lines, TRUTH.translation[None], BEARING_COUNT, LINE_COUNT), [pane])
     assert (score < 0).all()
 
 
 def test_the_widest_lines_are_those_that_fill_most_of_the_view(lines):
-    few = widest(lines, TRUTH.translation, 10)
-    assert len(few.feet) == 10
-    inside = lines.frames @ TRUTH.translation
-    spans = views_kernels.spans(lines.feet, lines.which, inside)
-    kept = views_kernels.spans(few.feet, few.which, inside)
-    np.testing.assert_allclose(np.sort(kept), np.sort(spans)[-10:])
-    assert widest(lines, TRUTH.translation, 10**4) is lines
+    inside = (lines.frames @ TRUTH.translation)[None]
+    spans = views_kernels.spans(lines.feet, lines.which, inside)[0]
+    few = widest(lines, inside, 10)[0]
+    np.testing.assert_allclose(spans[few], np.sort(spans)[::-1][:10])
+    assert sorted(widest(lines, inside, 10**4)[0]) == list(range(len(spans)))

@@ -9,10 +9,11 @@ import numpy as np
 
 from roel_service.arrays import Array
 from roel_service.geometry.vectors import unit
-from roel_service.pano_loc.arcs import Crop, PanoramaArcs, crops
+from roel_service.pano_loc.arcs import Crop, PanoramaArcs, Tiling, crops
 from roel_service.pano_loc.fgpl import line_kernels
 
 WIDTH_PX, CROP_PX = 1024, 120
+TILING = Tiling(((0.0, 12), (45.0, 6), (-45.0, 6), (90.0, 1), (-90.0, 1)), 60.0)
 LSD_QUANT = 0.7
 
 
@@ -32,7 +33,7 @@ def extract_lines(grey: Array) -> PanoramaArcs:
 
 @lru_cache(maxsize=1)  # beside the default's crops, which are of another size
 def _crops() -> tuple[Crop, ...]:
-    return crops(WIDTH_PX, CROP_PX)
+    return crops(WIDTH_PX, CROP_PX, TILING)
 
 
 def merge_lines(ends: Array) -> PanoramaArcs:
