@@ -483,7 +483,7 @@ class LocalizeConfig(Stage, table="localize"):
     """
 
     max_width_px: int = parameter(2048, Rule("512 to 8192", lambda value: 512 <= value <= 8192))
-    crop_px: int = parameter(240, Rule("64 to 1024", lambda value: 64 <= value <= 1024))
+    crop_px: int = parameter(272, Rule("64 to 1024", lambda value: 64 <= value <= 1024))
     min_arc_deg: float = parameter(2.0, at_most(45))
     max_arc_count: int = parameter(500, at_most(5000))
     grid_step_m: float = parameter(0.3, POSITIVE)
