@@ -80,7 +80,9 @@ class PreparedMap:
             return self
         offset = self.segments.mean(axis=1) - place
         away = offset - dot(offset, self.directions)[:, None] * self.directions
-        size = norm(self.segments[:, 1] - self.segments[:, 0]) * norm(away) / (offset**2).sum(axis=1)
+        size = (
+            norm(self.segments[:, 1] - self.segments[:, 0]) * norm(away) / (offset**2).sum(axis=1)
+        )
         chosen = np.argpartition(-size, count)[:count]
         return replace(
             self,

@@ -79,9 +79,7 @@ def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
     )
 
 
-def refine_poses(
-    candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap
-) -> Candidates:
+def refine_poses(candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Candidates:
     """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
     modes = _refined(
@@ -94,9 +92,7 @@ def refine_poses(
     )
     best = distinct(_weighed(modes, arcs, prepared), FINALIST_COUNT)
     samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    refined = _refined(
-        best, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared)
-    )
+    refined = _refined(best, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared))
     return distinct(refined, FINALIST_COUNT)
 
 

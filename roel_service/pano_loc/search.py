@@ -165,9 +165,7 @@ def _best_of_all(places: FloatArray, scores: FloatArray) -> _Seeds:
     chosen = [_best_apart(*item) for item in zip(places, scores, strict=True)]
     rotation = np.repeat(np.arange(len(scores)), [len(item) for item in chosen])
     place = np.concatenate([np.array(item, dtype=np.int64) for item in chosen])
-    return _Seeds(
-        rotation=rotation, places=places[rotation, place], score=scores[rotation, place]
-    )
+    return _Seeds(rotation=rotation, places=places[rotation, place], score=scores[rotation, place])
 
 
 def _best_apart(places: FloatArray, score: FloatArray) -> list[int]:

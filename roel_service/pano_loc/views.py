@@ -192,9 +192,7 @@ def pane_of(
     )
 
 
-def agreement(
-    views: Views, panes: Sequence[Pane], chosen: IntArray | None = None
-) -> FloatArray:
+def agreement(views: Views, panes: Sequence[Pane], chosen: IntArray | None = None) -> FloatArray:
     """(R, C, 2) scores of places in R orientations: beyond chance, and by likelihood.
 
     The first is right where all lines can be seen, the second where walls hide most of them.
@@ -217,9 +215,7 @@ def agreement(
     expected = np.stack([size @ column for size, column in zip(sizes, share, strict=True)])
     missed = np.stack([size @ column for size, column in zip(sizes, loss, strict=True)])
     size = np.maximum(np.stack([size.sum(axis=1) for size in sizes]), 1.0)
-    return np.stack(
-        [(total[:, :, 0] - expected) / np.sqrt(size), total[:, :, 1] + missed], axis=2
-    )
+    return np.stack([(total[:, :, 0] - expected) / np.sqrt(size), total[:, :, 1] + missed], axis=2)
 
 
 def _sizes_in(views: Views, pane: Pane) -> FloatArray:
