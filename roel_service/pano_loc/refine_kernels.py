@@ -68,9 +68,9 @@ def _mark_alike(
     middle: Array,
     planes: Array,
     ways: Array,
-    cosine: float,
-    sine: float,
-    aside_sine: float,
+    cosine: np.float32,
+    sine: np.float32,
+    aside_sine: np.float32,
     alike: BoolArray,
 ) -> None:
     """Mark lines whose viewing planes (3, L) and directions (3, L) agree with an arc's."""
@@ -244,7 +244,12 @@ def jacobian(
 
 @numba.njit(cache=True, nogil=True)
 def _mark_passing(
-    direction: Array, middle: Array, normals: Array, sine: float, reach_sine: float, near: BoolArray
+    direction: Array,
+    middle: Array,
+    normals: Array,
+    sine: np.float32,
+    reach_sine: np.float32,
+    near: BoolArray,
 ) -> None:
     """Mark arcs of (3, A) normals that have a line's direction and pass by its middle."""
     dx, dy, dz = direction

@@ -210,4 +210,4 @@ def _inflation(mean_square: float) -> float:
     Found by experiment: maps of simulated rooms, and few of their lines with noise of 3 cm.
     """
     excess = max(mean_square - DETECTOR_RMS_RAD**2, 0.0)
-    return 1.0 + (excess / MAP_RMS_RAD**2) ** 2.5
+    return 1.0 + float((excess / MAP_RMS_RAD**2) ** 2.5)
