@@ -81,3 +81,33 @@ def test_of_two_poses_that_are_one_the_better_stays():
         5,
     )
     assert found.poses.translation[:, 0].tolist() == [0.1, 2.0]
+
+
+@pytest.mark.parametrize("slack_deg", [0.0, 3.0])
+def test_lines_nearby_are_all_that_rays_can_lie_on(prepared, slack_deg):
+    """At poses within the slack, too."""
+    T = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
+    samples = sample_arcs(seen_from(T, segments_of()), 0.05)
+    turned = T.retract(np.array([0.4, -0.3, 0.5, 0.0, 0.0, 0.0]) * np.deg2rad(slack_deg))
+    nearby = lines_nearby(T, samples, prepared, np.deg2rad(slack_deg))
+    every = np.arange(len(prepared))
+    offsets = np.arange(len(samples.normals) + 1) * len(every)
+    all_lines = (offsets, np.tile(every, len(samples.normals)))
+    found = match(turned, samples, prepared, nearby, FINAL_GATE_RAD)
+    expected = match(turned, samples, prepared, all_lines, FINAL_GATE_RAD)
+    # Far along the arc a line may be asked that its ends exclude: those have larger residuals.
+    near = np.abs(expected.residual) < np.sin(FINAL_GATE_RAD)
+    assert near.mean() > 0.9
+    np.testing.assert_array_equal(found.line[near], expected.line[near])
+
+
+def test_the_widest_lines_of_a_place_are_those_that_take_up_most_of_its_view(prepared):
+    place = np.array([1.0, 1.0, 1.2])
+    few = prepared.widest(place, 5)
+    ends = unit(few.segments - place)
+    angle = np.arccos(np.clip((ends[:, 0] * ends[:, 1]).sum(axis=1), -1, 1))
+    every = unit(prepared.segments - place)
+    others = np.arccos(np.clip((every[:, 0] * every[:, 1]).sum(axis=1), -1, 1))
+    assert len(few) == 5
+    assert np.median(angle) > np.quantile(others, 0.8)
+    assert prepared.widest(place, 10**4) is prepared
