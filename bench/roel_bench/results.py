@@ -26,6 +26,8 @@ FILE_NAME = "mapping.json"
 FORMAT = "roel mapping benchmark 1"
 # Thousands of rows are a few megabytes.
 MAX_BYTES = 256 << 20
+# What the lines of single frames depend on.
+FRONT_END_TABLES = ("frames", "detect", "plane_fit")
 PACKAGES = ("numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
 
@@ -40,12 +42,14 @@ class Row:
         method: name of the variant or of the peer.
         config_digest: of every parameter of the method; tells whether the row is still true.
         figures: by name; None where there is no figure, e.g. the accuracy of an empty map.
-        seconds: wall-clock time of each stage.
+        seconds: wall-clock time of each stage; other work on the machine lengthens it.
         frame_count, event_count: frames looked at, 0 for a method without frames; events read.
         peak_rss_mib: the largest resident memory while the method ran; None where the system does
             not tell.
         error: why there is no map, and so no figure: the reason and what was found; empty where
             there is one. A map without lines is no error.
+        processor_s: processor time of all threads, which a busy machine hardly changes; None where
+            it was not measured.
     """
 
     task: str
@@ -61,6 +65,7 @@ class Row:
     event_count: int
     peak_rss_mib: float | None
     error: str = ""
+    processor_s: float | None = None
 
     @property
     def key(self) -> tuple[str, ...]:
@@ -73,6 +78,13 @@ class Row:
         if self.frame_count == 0:
             return None
         return 1e3 * sum(self.seconds.values()) / self.frame_count
+
+    @property
+    def processor_ms_per_frame(self) -> float | None:
+        """All stages and threads together; None where it was not measured."""
+        if self.frame_count == 0 or self.processor_s is None:
+            return None
+        return 1e3 * self.processor_s / self.frame_count
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,6 +159,12 @@ def config_digest(config: Config) -> str:
     refine = tables["refine"]
     tables["refine"] = {key: refine[key] for key in refine if not key.startswith(off)}
     return digest_of(json.dumps(tables, sort_keys=True))
+
+
+def front_end_digest(config: Config) -> str:
+    """Twelve hexadecimal digits that change with any parameter of the lines of single frames."""
+    tables = to_tables(config)
+    return digest_of(json.dumps({name: tables[name] for name in FRONT_END_TABLES}, sort_keys=True))
 
 
 def digest_of(text: str) -> str:

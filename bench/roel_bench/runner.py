@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -29,14 +30,13 @@ from roel_bench.results import (
     NO_DISTURBANCE,
     Results,
     Row,
-    config_digest,
     read_results,
     this_machine,
     write_results,
 )
 from roel_bench.scenes import MapTruth, Scene
 from roel_bench.scores import score
-from roel_bench.suites import DRAWN_METHODS, FRONT_END, PRESET_NAMES, Cell
+from roel_bench.suites import DRAWN_METHODS, FRONT_END, PRESET_NAMES, Cell, current_digest
 from roel_bench.variants import find_variant
 from roel_service.errors import InputError, NoAnswerError, NotFoundError
 from roel_service.progress import Progress, ProgressCallback, ignore
@@ -74,7 +74,7 @@ class Runner:
         """
         cells = list(cells)
         openers = {name: find_scene(name, self.places) for name in {c.scene for c in cells}}
-        digests = [_digest(cell) for cell in cells]
+        digests = [current_digest(cell.task, cell.method) for cell in cells]
         results = self._results()
         scene: Scene | None = None
         truths = _FrameTruths()
@@ -139,10 +139,12 @@ class Runner:
         self._warm_up(cell)
         method = find_method(cell.method)
         memory.reset_peak()
+        began_s = time.process_time()
         try:
             mapped = method.run(scene, step)
         except NoAnswerError as error:
             return _failed(cell, scene, method, error)
+        processor_s = time.process_time() - began_s
         peak_rss_mib = memory.peak_mib()
         figures = score(scene, mapped.entities)
         if cell.disturbance == NO_DISTURBANCE and cell.method in DRAWN_METHODS:
@@ -161,6 +163,8 @@ class Runner:
             frame_count=mapped.frame_count,
             event_count=mapped.event_count,
             peak_rss_mib=peak_rss_mib,
+            # A method without frames, LIMAP above all, may work in a process of its own.
+            processor_s=processor_s if mapped.frame_count else None,
         )
 
     def _front_end_row(
@@ -186,7 +190,7 @@ class Runner:
             is_tuning=scene.is_tuning,
             disturbance=cell.disturbance,
             method=cell.method,
-            config_digest=config_digest(config),
+            config_digest=current_digest(cell.task, cell.method),
             figures=scores.figures(),
             seconds=scores.seconds,
             frame_count=scores.frame_count,
@@ -248,13 +252,6 @@ def _failed(cell: Cell, scene: Scene, method: Method, error: NoAnswerError) -> R
         peak_rss_mib=None,
         error=f"{error.reason}: {error.found}",
     )
-
-
-def _digest(cell: Cell) -> str:
-    """Of every parameter of the method, as its row would carry it."""
-    if cell.task == FRONT_END:
-        return config_digest(find_variant(cell.method).config)
-    return find_method(cell.method).digest
 
 
 def _spread(frames: list[FrameLines]) -> list[FrameLines]:

@@ -16,8 +16,8 @@ from roel_bench.catalogue import (
     TUNING_ROOMS,
 )
 from roel_bench.disturbances import DISTURBANCES, NOISY_POSES
-from roel_bench.methods import PEERS
-from roel_bench.results import NO_DISTURBANCE
+from roel_bench.methods import PEERS, find_method
+from roel_bench.results import NO_DISTURBANCE, front_end_digest
 from roel_bench.variants import (
     CURVE_VARIANTS,
     FRONT_END_VARIANTS,
@@ -25,6 +25,7 @@ from roel_bench.variants import (
     PRESET_VARIANTS,
     REFINED_POSES,
     Variant,
+    find_variant,
 )
 from roel_service.errors import InputError
 
@@ -50,6 +51,13 @@ class Cell:
     def key(self) -> tuple[str, ...]:
         """The key of the row that it gives."""
         return (self.task, self.scene, self.disturbance, self.method)
+
+
+def current_digest(task: str, method: str) -> str:
+    """Of every parameter of a method, as its rows carry it; `ConfigError` for an unknown one."""
+    if task == FRONT_END:
+        return front_end_digest(find_variant(method).config)
+    return find_method(method).digest
 
 
 def _cells(

@@ -6,6 +6,7 @@ import numpy as np
 
 from roel_bench.results import NO_DISTURBANCE, Row
 from roel_bench.scenes import MapTruth, Scene
+from roel_bench.suites import current_digest
 from roel_service.geometry.se3 import SE3
 from roel_service.scene.camera import Camera
 from roel_service.scene.clouds import PointCloud, TriangleMesh
@@ -68,14 +69,15 @@ def scene(**changes):
 
 def row(scene="sim_201_640x480_8s", method="default", **changes):
     figures = changes.pop("figures", {})
+    task = changes.pop("task", "map")
     given = {
-        "task": "map",
+        "task": task,
         "scene": scene,
         "sensor": scene.split("_")[2] if scene.startswith("sim") else "640x480",
         "is_tuning": False,
         "disturbance": NO_DISTURBANCE,
         "method": method,
-        "config_digest": "0" * 12,
+        "config_digest": current_digest(task, method),
         "figures": figures,
         "seconds": {"detect": 1.0, "refine": 1.0},
         "frame_count": 20,

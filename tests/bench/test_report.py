@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 
 from roel_bench import report
@@ -95,7 +97,7 @@ def test_page_tells_what_a_part_is_worth():
     page = report.document(RESULTS)
     # 0.3 instead of 0.4, and 0.5 instead of 0.4.
     assert line_of(page, DEFAULT_ABLATION[0].name).endswith("| 25.0 |")
-    assert line_of(page, DEFAULT_ABLATION[1].name).endswith("| -25.0 |")
+    assert line_of(page, DEFAULT_ABLATION[1].name).endswith("| -66.7 |")
 
 
 def test_page_marks_tuning_rooms_and_shows_recordings():
@@ -114,7 +116,7 @@ def test_tables_have_equal_columns():
 
 
 def test_newest_row_of_a_cell_counts():
-    newer = row(LARGE, config_digest="1" * 12, figures=figures(0.9))
+    newer = row(LARGE, figures=figures(0.9))
     page = report.document(RESULTS.with_row(newer))
     assert "default, sim_201_640x480_8s | 400 | 8.0 | 2.0 | 50 | 0.450" in page
 
@@ -177,3 +179,14 @@ def test_round_edges_are_told_of_where_they_were_mapped():
     assert "| 0.250 |" in line_of(section, f"default, {room}")
     assert "| 0.450 |" in line_of(section, f"{method}, {room}")
     assert "## Round edges" in all_rows(results)
+
+
+def test_rows_of_other_parameters_are_left_out():
+    stale = row(LARGE, config_digest="0" * 12, figures=figures(0.9))
+    gone = row(LARGE, figures=figures(0.9))
+    gone = replace(gone, method="a method that there is no more")
+    results = replace(RESULTS, rows=(stale, gone))
+    text = report.document(results)
+    assert "2 rows of other parameters than today's are left out" in text
+    assert "0.900" not in text
+    assert "are left out until" not in report.document(RESULTS)

@@ -7,6 +7,7 @@ import pytest
 from roel_bench.results import (
     Results,
     config_digest,
+    front_end_digest,
     read_results,
     this_machine,
     write_results,
@@ -68,6 +69,13 @@ def test_digest_does_not_follow_corners_that_are_left_alone():
     assert config_digest(other) == config_digest(paper)
 
 
+def test_digest_of_single_frames_follows_their_stages_alone():
+    default = preset("default")
+    trimmed = with_tables(default, {"trim": {"max_gap_m": 0.1}}, subject="sample")
+    detected = with_tables(default, {"detect": {"blur_px": 2.0}}, subject="sample")
+    assert front_end_digest(trimmed) == front_end_digest(default) != front_end_digest(detected)
+
+
 @pytest.mark.parametrize(
     ("on", "parameter"),
     [
@@ -84,6 +92,12 @@ def test_digest_follows_the_parameters_of_what_is_on(on, parameter):
 def test_milliseconds_a_frame_are_of_all_stages():
     assert row().ms_per_frame == 100.0
     assert row(frame_count=0).ms_per_frame is None
+
+
+def test_processor_time_is_told_where_it_was_measured():
+    assert row(processor_s=1.5).processor_ms_per_frame == 75.0
+    assert row().processor_ms_per_frame is None
+    assert row(processor_s=1.5, frame_count=0).processor_ms_per_frame is None
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "x"}'])

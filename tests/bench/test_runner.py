@@ -5,10 +5,10 @@ import pytest
 
 from roel_bench import runner
 from roel_bench.catalogue import WARM_UP_ROOM, Places
-from roel_bench.methods import Mapped, Method, find_method
+from roel_bench.methods import Mapped, Method
 from roel_bench.results import FILE_NAME, Results, read_results, write_results
 from roel_bench.runner import Runner
-from roel_bench.suites import FRONT_END, MAP, Cell
+from roel_bench.suites import FRONT_END, MAP, Cell, current_digest
 from roel_bench.tables import all_rows
 from roel_service.errors import InputError, NoAnswerError
 from roel_service.progress import Progress
@@ -45,9 +45,12 @@ def test_every_cell_has_its_row(folder):
     assert 0 <= clean.figures["iou_20"] < 1
     assert clean.frame_count >= 24
     assert clean.ms_per_frame > 0
+    assert clean.processor_s > 0
     assert clean.seconds.keys() > {"detect", "plane_fit", "trim"}
     assert 0 < frames.figures["f_score"] < 1
-    assert all(row.config_digest == find_method("default").digest for row in rows)
+    assert [row.config_digest for row in rows] == [
+        current_digest(cell.task, cell.method) for cell in CELLS
+    ]
 
 
 def test_pictures_are_of_what_is_not_disturbed(folder):
