@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from roel_bench.catalogue import Places, open_scene
-from roel_bench.poses_cube import CubeRow, cube_rows
+from roel_bench.poses_cube import ALONE, CubeRow, cube_rows
 from roel_bench.poses_rooms import PoseErrors, RoomRow, room_row
 from roel_bench.results import this_machine
 from roel_bench.scenes import Scene
@@ -56,7 +56,7 @@ def run(
     empty = PoseResults(machine=machine.machine, versions=machine.versions)
     results = read_results(path) if path.exists() else empty
     wanted_rooms = [name for name in rooms if name not in {row.room for row in results.rooms}]
-    done_seeds = {row.seed for row in results.cube if row.method == "default"}
+    done_seeds = {row.seed for row in results.cube if row.method == ALONE}
     seeds = [seed for seed in range(seed_count) if seed not in done_seeds]
     total = len(wanted_rooms) + len(seeds)
     done = 0
@@ -72,7 +72,7 @@ def run(
             kept = [old for old in results.cube if (old.method, old.seed) != (row.method, row.seed)]
             results = replace(results, cube=[*kept, row])
             write_results(path, results)
-            done += row.method == "default"
+            done += row.method == ALONE
             tell("cube")
     for name in wanted_rooms:
         tell(name)

@@ -2,7 +2,8 @@
 
 As published, the pipeline of preset `paper` runs up to triangulation with true poses; then noise is put
 on positions and Euler angles, and each row refines lines and poses over the same tracks. The default
-gets the same noisy poses and the events, and finds its lines itself.
+gets the same noisy poses and the events: once with the map that it builds with true poses, and once
+alone, where it finds its lines itself.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from roel_service.mapping.batch import refine_batch
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.first_lines import matched_tracks, triangulated_lines
 from roel_service.mapping.front_end import Detected, lines_of_all_frames
+from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine import Refined
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun
@@ -33,6 +35,9 @@ from roel_service.simulate.motion import with_white_noise
 
 # The cube is a few metres of a room large, in units: lengths of the default are in metres.
 UNITS_PER_M = 10.0
+POSE_RATE_HZ = 100.0
+# What is left of the noise, in units, once its jitter is smoothed out.
+SMOOTH_DRIFT = 0.1
 STEP_COUNT = 60
 
 PAPER = preset("paper").refine
@@ -46,6 +51,8 @@ METHODS: dict[str, RefineConfig | None] = {
     "line Grassmann, quartic": replace(PAPER, event_weight=0.0, loss="quartic"),
     "line + event Grassmann, quartic": replace(PAPER, loss="quartic"),
 }
+# The default's rows: with the map of true poses, and from events and noisy poses alone.
+IN_A_MAP, ALONE = "default, in the map", "default"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,6 +85,9 @@ def cube_rows(scene: Scene, seeds: Iterable[int]) -> Iterator[CubeRow]:
         raise NoAnswerError("cube", "true poses", "none")
     detected, refined = triangulated(scene, scene.trajectory)
     true = detected.frames.T_world_camera
+    true_map = build_line_map(
+        scene.events, scene.trajectory, scene.camera, default_config()
+    ).line_map
     for seed in seeds:
         noisy = with_white_noise(true, 1.0, np.random.default_rng(seed))
         for method, config in METHODS.items():
@@ -85,20 +95,40 @@ def cube_rows(scene: Scene, seeds: Iterable[int]) -> Iterator[CubeRow]:
             poses = noisy if config is None else _batch(detected, refined, noisy, config)
             seconds = time.process_time() - began
             yield _row(method, seed, detected, poses, len(refined), seconds, scene.trajectory)
-        began = time.process_time()
         given = Trajectory(t_us=detected.frames.t_us, T_world_camera=noisy)
-        result = refine_poses(scene.events, given, scene.camera, default_config())
-        seconds = time.process_time() - began
-        found = result.trajectory.T_world_camera
-        lines = result.report.line_count
-        yield _row("default", seed, detected, found, lines, seconds, scene.trajectory)
+        for method, line_map in ((IN_A_MAP, true_map), (ALONE, None)):
+            began = time.process_time()
+            result = refine_poses(
+                scene.events, given, scene.camera, default_config(), line_map=line_map
+            )
+            seconds = time.process_time() - began
+            found = result.trajectory.T_world_camera
+            lines = result.report.line_count
+            yield _row(method, seed, detected, found, lines, seconds, scene.trajectory)
 
 
 def default_config() -> Config:
-    """The default, in units of the cube."""
+    """The default in units of the cube, for poses that are off each by itself.
+
+    Their noise is white up to half their rate, so that frames are as many as they are, and the
+    correction may change faster than an odometry's drift does.
+    """
     config = preset("default")
-    drift = replace(config.refine, pose_drift_m=UNITS_PER_M * config.refine.pose_drift_m)
-    return replace(config, refine=drift)
+    trim = config.trim
+    return replace(
+        config,
+        frames=replace(config.frames, rate_hz=POSE_RATE_HZ),
+        refine=replace(
+            config.refine, pose_interval_us=50_000, pose_drift_m=SMOOTH_DRIFT, pose_drift_s=0.3
+        ),
+        trim=replace(
+            trim,
+            max_gap_m=UNITS_PER_M * trim.max_gap_m,
+            min_length_m=UNITS_PER_M * trim.min_length_m,
+            max_sigma_m=UNITS_PER_M * trim.max_sigma_m,
+            overlap_distance_m=UNITS_PER_M * trim.overlap_distance_m,
+        ),
+    )
 
 
 def triangulated(scene: Scene, trajectory: Trajectory) -> tuple[Detected, Refined]:
