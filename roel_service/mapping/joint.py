@@ -57,7 +57,8 @@ class JointlyRefined:
     Attributes:
         lines: L lines, world.
         correction: of the trajectory that the frames' poses came from.
-        drift: of that trajectory, as the correction tells it.
+        drift: of that trajectory, as the correction tells it, in position no larger than expected.
+        drift_told: the same, however large.
         information: (6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2.
         costs: of the observations after each step, the first one before any; in units of their
             noise.
@@ -67,6 +68,7 @@ class JointlyRefined:
     lines: InfiniteLines
     correction: PoseCorrection
     drift: Drift
+    drift_told: Drift
     information: FloatArray
     costs: list[float]
     converged: bool
@@ -77,6 +79,7 @@ class _State:
     lines: OrthonormalLines
     correction: PoseCorrection
     drift: Drift
+    drift_told: Drift
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,6 +167,7 @@ def refine_jointly(
         lines=problem.world_lines(state),
         correction=state.correction,
         drift=state.drift,
+        drift_told=state.drift_told,
         information=problem.reduced(system, 0.0).hessian,
         costs=[*costs, system.observation_cost],
         converged=converged,
@@ -207,7 +211,12 @@ class _Problem:
     def first_state(self, lines: InfiniteLines, correction: PoseCorrection, drift: Drift) -> _State:
         moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
         U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
-        return _State(lines=OrthonormalLines(U=U, phi=phi), correction=correction, drift=drift)
+        return _State(
+            lines=OrthonormalLines(U=U, phi=phi),
+            correction=correction,
+            drift=drift,
+            drift_told=drift,
+        )
 
     def world_lines(self, state: _State) -> InfiniteLines:
         direction, moment = state.lines.plucker
@@ -374,9 +383,12 @@ class _Problem:
     def with_drift(self, state: _State, reduced: _Reduced) -> _State:
         """With the drift that the correction tells of, as well as the last step's system knows."""
         covariance = np.asarray(np.linalg.inv(reduced.hessian), dtype=np.float64)
-        drift = state.drift.estimated(state.correction, covariance)
+        told = state.drift.estimated(state.correction, covariance)
         configured = Drift.configured(self.config)
-        return replace(state, drift=drift.at_least(LEAST_DRIFT_SHARE, configured))
+        drift = told.at_least(LEAST_DRIFT_SHARE, configured)
+        # The path's size and shape are what lines hold least: its drift would feed on itself.
+        drift = replace(drift, sigma_m=min(drift.sigma_m, configured.sigma_m))
+        return replace(state, drift=drift, drift_told=told)
 
     def _total(self, rows: FloatArray) -> FloatArray:
         """(L,) sums of (S,) rows over each line."""

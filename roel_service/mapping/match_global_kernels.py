@@ -34,6 +34,14 @@ def observations_along(
     Returns:
         Lines (n,) and observations (n,), pairwise.
     """
+    count = len(observed)
+    left, right = np.empty(count), np.empty(count)
+    top, bottom = np.empty(count), np.empty(count)
+    for k in range(count):
+        left[k] = min(observed[k, 0, 0], observed[k, 1, 0])
+        right[k] = max(observed[k, 0, 0], observed[k, 1, 0])
+        top[k] = min(observed[k, 0, 1], observed[k, 1, 1])
+        bottom[k] = max(observed[k, 0, 1], observed[k, 1, 1])
     lines, members = [], []
     for j in range(len(projected)):
         if np.isnan(projected[j, 0, 0]):
@@ -46,13 +54,11 @@ def observations_along(
         # Positions along the image line; its direction is (b, -a).
         p0, p1 = b * x0 - a * y0, b * x1 - a * y1
         low_p, high_p = min(p0, p1), max(p0, p1)
-        for k in range(len(observed)):
+        for k in range(count):
+            if right[k] < low_x or left[k] > high_x or bottom[k] < low_y or top[k] > high_y:
+                continue
             sx, sy = observed[k, 0]
             ex, ey = observed[k, 1]
-            if max(sx, ex) < low_x or min(sx, ex) > high_x:
-                continue
-            if max(sy, ey) < low_y or min(sy, ey) > high_y:
-                continue
             if abs(a * sx + b * sy + c) > max_distance or abs(a * ex + b * ey + c) > max_distance:
                 continue
             q0, q1 = b * sx - a * sy, b * ex - a * ey

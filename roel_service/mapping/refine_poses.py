@@ -30,10 +30,11 @@ from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.pose_jumps import pose_jumps
+from roel_service.mapping.pose_windows import laid_over, pose_windows, seen_between
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.smooth_poses import smoothed
-from roel_service.mapping.time_offset import TimeOffset, time_offset
+from roel_service.mapping.time_offset import TimeOffset, mean_offset, time_offset
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.views import views_of
 from roel_service.progress import ProgressCallback, ignore, part_of
@@ -71,15 +72,17 @@ TRACK_MARGIN_PX = 1.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Found:
-    """What one run over the events found.
+    """What was found in one window of a recording.
 
     Attributes:
+        window: the poses of the window, among all.
         given: the trajectory that was refined, on the clock of the events.
         smooth: the same without jitter.
         refined: lines with their tracks.
         rounds: of matching and refinement.
     """
 
+    window: slice
     given: Trajectory
     smooth: Trajectory
     refined: Refined
@@ -123,7 +126,7 @@ def refine_poses(
     Raises:
         EventsError: no events.
         TrajectoryError: poses that cover less than a tenth of the recording.
-        LimitError: RECORDING_TOO_LONG.
+        LimitError: RECORDING_TOO_LONG, a gap in the poses that is longer than can be refined at once.
         NoAnswerError: too few lines.
         Cancelled: as raised by `progress`.
     """
@@ -136,18 +139,21 @@ def refine_poses(
             t_us=trajectory.t_us + applied_us, T_world_camera=trajectory.T_world_camera
         )
         found = _found(events, given, camera, config, line_map, run)
-        left = found.time_offset
+        left = mean_offset([window.time_offset for window in found])
         if index + 1 == count or not left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT):
             break
         applied_us += round(left.offset_us)
     report = _report(found, left, trajectory, config, applied_us, seconds)
     for problem in report.problems:
         logger.warning("poses: %s", PROBLEMS[problem])
-    return PoseResult(
-        trajectory=_at_given_times(found, trajectory, is_aligned=line_map is None),
-        covariance=_covariance(found.last, found.given),
-        report=report,
+    poses, covariance = laid_over(
+        trajectory.t_us,
+        [window.window for window in found],
+        [_at_given_times(window, trajectory, is_aligned=line_map is None) for window in found],
+        [_covariance(window.last, window.given) for window in found],
     )
+    refined = Trajectory(t_us=trajectory.t_us, T_world_camera=poses)
+    return PoseResult(trajectory=refined, covariance=covariance, report=report)
 
 
 def _found(
@@ -157,33 +163,58 @@ def _found(
     config: Config,
     line_map: LineMap | None,
     run: MappingRun,
-) -> _Found:
-    """One run over the events."""
+) -> list[_Found]:
+    """One run over the events: what each window of poses has come to."""
     counted = CountedEvents(events, given)
-    correction = PoseCorrection.none(given, config.refine.pose_interval_us)
     smooth = smoothed(given)
     detector = line_detector(config.detect)
     detected = lines_of_all_frames(counted, smooth, camera, config, detector, run)
     counted.check_coverage()
+    return [
+        _found_in(window, detected, given, smooth, config, line_map, run)
+        for window in pose_windows(given, config.refine)
+    ]
+
+
+def _found_in(
+    window: slice,
+    detected: Detected,
+    given: Trajectory,
+    smooth: Trajectory,
+    config: Config,
+    line_map: LineMap | None,
+    run: MappingRun,
+) -> _Found:
+    """The refined poses of one window."""
+    given, smooth = _of_window(given, window), _of_window(smooth, window)
+    detected = seen_between(detected, int(given.t_us[0]), int(given.t_us[-1]))
+    correction = PoseCorrection.none(given, config.refine.pose_interval_us)
     if line_map is None:
         refined, rounds = _with_own_lines(detected, smooth, correction, config, run)
     else:
         refined, rounds = _in_map(line_map, detected, smooth, correction, config, run)
-    return _Found(given=given, smooth=smooth, refined=refined, rounds=rounds)
+    return _Found(window=window, given=given, smooth=smooth, refined=refined, rounds=rounds)
 
 
-def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) -> Trajectory:
-    """The refined poses, in the world of the given ones or of the map."""
+def _of_window(trajectory: Trajectory, window: slice) -> Trajectory:
+    return Trajectory(
+        t_us=trajectory.t_us[window], T_world_camera=trajectory.T_world_camera[window]
+    )
+
+
+def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) -> SE3:
+    """The refined poses of a window, in the world of the given ones or of the map."""
+    asked = _of_window(trajectory, found.window)
     poses = found.last.correction.trajectory(found.smooth).T_world_camera
     if is_aligned:
-        poses = _as_large_as(poses, trajectory.T_world_camera)
-        poses = align_poses(poses, trajectory.T_world_camera) @ poses
+        poses = _as_large_as(poses, asked.T_world_camera)
+        poses = align_poses(poses, asked.T_world_camera) @ poses
+    if found.given.t_us[0] == asked.t_us[0]:
+        return poses
     refined = Trajectory(t_us=found.given.t_us, T_world_camera=poses)
-    if found.given.t_us[0] == trajectory.t_us[0]:
-        return refined
     # Poses that the other clock leaves without a time of their own stay at the ends.
-    times_us = np.clip(trajectory.t_us, refined.t_us[0], refined.t_us[-1])
-    return Trajectory(t_us=trajectory.t_us, T_world_camera=refined.interpolate(times_us))
+    times_us = np.clip(asked.t_us, refined.t_us[0], refined.t_us[-1])
+    return refined.interpolate(times_us)
 
 
 def _as_large_as(poses: SE3, given: SE3) -> SE3:
@@ -198,23 +229,23 @@ def _as_large_as(poses: SE3, given: SE3) -> SE3:
 
 
 def _report(
-    found: _Found,
+    found: list[_Found],
     left: TimeOffset,
     trajectory: Trajectory,
     config: Config,
     applied_us: int,
     seconds: dict[str, float],
 ) -> PoseReport:
-    rounds = found.rounds
-    observation_count = len(found.refined.tracks.observation)
+    observation_count = sum(len(window.refined.tracks.observation) for window in found)
     px2 = config.refine.pose_noise_px**2 / max(1, observation_count)
+    rounds = [joint for window in found for joint in window.rounds]
     return PoseReport(
-        line_count=len(found.refined),
+        line_count=sum(len(window.refined) for window in found),
         observation_count=observation_count,
         iteration_count=sum(len(joint.costs) - 1 for joint in rounds),
-        converged=rounds[-1].converged,
-        cost_initial=rounds[0].costs[0] * px2,
-        cost_final=rounds[-1].costs[-1] * px2,
+        converged=all(window.last.converged for window in found),
+        cost_initial=px2 * sum(window.rounds[0].costs[0] for window in found),
+        cost_final=px2 * sum(window.last.costs[-1] for window in found),
         time_offset_us=applied_us + left.offset_us,
         time_offset_sigma_us=left.sigma_us,
         problems=_problems(found, left, trajectory, config),
@@ -223,15 +254,19 @@ def _report(
 
 
 def _problems(
-    found: _Found, left: TimeOffset, trajectory: Trajectory, config: Config
+    found: list[_Found], left: TimeOffset, trajectory: Trajectory, config: Config
 ) -> tuple[PoseProblem, ...]:
     """What is wrong with the given poses beyond an odometry's jitter and drift."""
-    expected, drift = Drift.configured(config.refine), found.last.drift
+    expected = Drift.configured(config.refine)
+    drifts = [window.last.drift_told for window in found]
     is_there = {
         PoseProblem.JUMPS: bool(pose_jumps(trajectory).any()),
         PoseProblem.TIME_OFFSET: left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT),
-        PoseProblem.FAR_OFF: drift.sigma_rad > FAR_FACTOR * expected.sigma_rad
-        or drift.sigma_m > FAR_FACTOR * expected.sigma_m,
+        PoseProblem.FAR_OFF: any(
+            drift.sigma_rad > FAR_FACTOR * expected.sigma_rad
+            or drift.sigma_m > FAR_FACTOR * expected.sigma_m
+            for drift in drifts
+        ),
     }
     return tuple(problem for problem, there in is_there.items() if there)
 

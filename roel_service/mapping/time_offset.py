@@ -7,6 +7,7 @@ the refined correction and its normal equations; nothing is refined for it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,6 +57,17 @@ def time_offset(joint: JointlyRefined, trajectory: Trajectory) -> TimeOffset:
         return TimeOffset(offset_us=0.0, sigma_us=float("inf"))
     s = float(held @ joint.correction.control.ravel()) / information
     return TimeOffset(offset_us=-1e6 * s, sigma_us=1e6 * information**-0.5)
+
+
+def mean_offset(offsets: Sequence[TimeOffset]) -> TimeOffset:
+    """Of the windows of one recording, each as sure as it is."""
+    weights = np.array([offset.sigma_us for offset in offsets]) ** -2.0
+    if not weights.any():
+        return TimeOffset(offset_us=0.0, sigma_us=float("inf"))
+    values = np.array([offset.offset_us for offset in offsets])
+    return TimeOffset(
+        offset_us=float(weights @ values / weights.sum()), sigma_us=float(weights.sum() ** -0.5)
+    )
 
 
 def control_times_us(correction: PoseCorrection) -> FloatArray:

@@ -156,7 +156,9 @@ class TestGradient:
         moment = plucker.shift_origin(start.lines.direction, start.lines.moment, problem.origin)
         U, phi = plucker.orthonormal_from_plucker(start.lines.direction, moment)
         drift = Drift.configured(config)
-        state = _State(lines=OrthonormalLines(U=U, phi=phi), correction=wrong, drift=drift)
+        state = _State(
+            lines=OrthonormalLines(U=U, phi=phi), correction=wrong, drift=drift, drift_told=drift
+        )
         weight = rng.uniform(0.1, 1.0, len(problem.line))
         system = problem.system(state, weight)
         assert problem.cost(state, weight) == pytest.approx(system.cost, rel=1e-12)
@@ -164,7 +166,9 @@ class TestGradient:
         def cost(line_step, control_step):
             moved = plucker.retract_orthonormal(U, phi, line_step)
             lines = OrthonormalLines(U=moved[0], phi=moved[1])
-            stepped = _State(lines=lines, correction=wrong.stepped(control_step), drift=drift)
+            stepped = _State(
+                lines=lines, correction=wrong.stepped(control_step), drift=drift, drift_told=drift
+            )
             return problem.cost(stepped, weight)
 
         no_line, no_control = np.zeros((len(phi), 4)), np.zeros((len(wrong), 6))

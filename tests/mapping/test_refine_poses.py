@@ -3,9 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from roel_service.errors import Cancelled, LimitError, NoAnswerError
+from roel_service.errors import Cancelled, NoAnswerError
 from roel_service.evaluation.poses import trajectory_errors, translation_errors_m
 from roel_service.geometry.alignment import align_points
+from roel_service.mapping import pose_windows
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.scene.lines import LineMap
@@ -144,12 +145,18 @@ class TestInAMap:
         assert caught.value.reason == "TOO_FEW_LINES"
 
 
-def test_too_many_control_points_are_refused_before_any_work(noisy):
-    fine = dataclasses.replace(
-        CONFIG, refine=dataclasses.replace(CONFIG.refine, pose_interval_us=1_000)
-    )
-    with pytest.raises(LimitError, match="poses to refine"):
-        refine_poses(event_stream(), noisy, CAMERA, fine)
+def test_a_long_recording_is_refined_in_windows(noisy, found, monkeypatch):
+    monkeypatch.setattr(pose_windows, "MAX_CONTROL_COUNT", 16)
+    monkeypatch.setattr(pose_windows, "WINDOW_INTERVAL_COUNT", 12)
+    windowed = refine_poses(event_stream(), noisy, CAMERA, CONFIG)
+    before = trajectory_errors(noisy, trajectory())
+    after = trajectory_errors(windowed.trajectory, trajectory())
+    assert after.ate_rmse_m < 0.8 * before.ate_rmse_m
+    assert windowed.report.line_count > found.report.line_count
+    np.testing.assert_array_equal(windowed.trajectory.t_us, noisy.t_us)
+    # Nothing jumps where one window fades into the other.
+    steps = np.diff(windowed.trajectory.T_world_camera.translation, axis=0)
+    assert np.linalg.norm(np.diff(steps, axis=0), axis=1).max() < 0.001
 
 
 def test_it_can_be_cancelled(noisy):
