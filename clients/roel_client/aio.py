@@ -237,12 +237,14 @@ class AsyncClient:
             await self.finalize(stream)
             yield stream
 
-    async def create_event_stream(self, stream_id: str, camera: Camera) -> str:
+    async def create_event_stream(
+        self, stream_id: str, camera: Camera, labels: Mapping[str, str] | None = None
+    ) -> str:
         """Open a recording; its name."""
         request = events_pb2.CreateEventStreamRequest(
             parent=names.PROJECT,
             event_stream_id=stream_id,
-            event_stream=events_pb2.EventStream(camera=camera_to_proto(camera)),
+            event_stream=events_pb2.EventStream(camera=camera_to_proto(camera), labels=labels),
         )
         created = await self._connection.call(self._streams.CreateEventStream, request)
         return str(created.name)

@@ -14,6 +14,7 @@ from google.protobuf.empty_pb2 import Empty
 from roel_service.errors import InputError, LimitError, TrajectoryError
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.append import EventSink
+from roel_service.service.labels import checked_labels
 from roel_service.service.operations import submitted
 from roel_service.service.paging import page_of, page_request
 from roel_service.service.records import event_stream_to_proto
@@ -57,8 +58,9 @@ class EventStreamServicer:
         names.check_parent(request.parent)
         stream_id = names.checked_id(request.event_stream_id, "event_stream_id")
         camera = camera_from_proto(request.event_stream.camera)
+        labels = checked_labels(request.event_stream.labels, self._settings)
         create = self._streams.create
-        record = await asyncio.to_thread(create, stream_id, camera, request_id(request))
+        record = await asyncio.to_thread(create, stream_id, camera, request_id(request), labels)
         return event_stream_to_proto(record)
 
     async def AppendEvents(

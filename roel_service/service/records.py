@@ -66,6 +66,8 @@ def event_stream_to_proto(record: EventStreamRecord) -> events_pb2.EventStream:
         digest=record.digest,
         etag=record.etag,
         create_time=_timestamp(record.create_time_us),
+        uid=record.uid,
+        labels=record.labels,
     )
 
 

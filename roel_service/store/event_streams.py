@@ -121,7 +121,11 @@ class EventStreams:
         self.locks = KeyedLocks()
 
     def create(
-        self, stream_id: str, camera: Camera, request: RequestId | None = None
+        self,
+        stream_id: str,
+        camera: Camera,
+        request: RequestId | None = None,
+        labels: dict[str, str] | None = None,
     ) -> EventStreamRecord:
         """Open a recording.
 
@@ -145,6 +149,7 @@ class EventStreams:
             longest_gap_us=0,
             create_time_us=now_us(),
             owner=CALLER.get().name,
+            labels=labels or {},
         )
 
         def act(connection: Connection) -> EventStreamRecord:

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -99,6 +99,7 @@ class EventStreamRecord:
     longest_gap_us: int
     create_time_us: int
     owner: str = ""
+    labels: dict[str, str] = field(default_factory=dict)
 
     @property
     def etag(self) -> str:
@@ -311,8 +312,13 @@ def stored(values: dict[str, Any]) -> dict[str, Any]:
 
 def event_stream_from_row(row: Row) -> EventStreamRecord:
     """The inverse of `row_from_record`."""
-    camera = _camera_from_json(row["camera"])
-    return EventStreamRecord(**{**row, "state": StreamState(row["state"]), "camera": camera})
+    parsed = {
+        "state": StreamState(row["state"]),
+        "camera": _camera_from_json(row["camera"]),
+        # What was remembered of a request before recordings had labels says nothing of them.
+        "labels": json.loads(row.get("labels", "{}")),
+    }
+    return EventStreamRecord(**{**row, **parsed})
 
 
 def map_version_from_row(row: Row) -> MapVersionRecord:

@@ -36,6 +36,7 @@ EVENT_STREAM = Table(
     Column("longest_gap_us", BigInteger, nullable=False),
     Column("create_time_us", BigInteger, nullable=False),
     Column("owner", String, nullable=False),
+    Column("labels", String, nullable=False),
 )
 
 EVENT_CHUNK = Table(

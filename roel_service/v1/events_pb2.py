@@ -29,13 +29,15 @@ from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__
 from roel_service.v1 import types_pb2 as roel__service_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1croel_service/v1/events.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1broel_service/v1/types.proto\"\xc7\x03\n\x0b\x45ventStream\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x03\x12\x37\n\x05state\x18\x02 \x01(\x0e\x32\".roel_service.v1.EventStream.StateB\x04\xe2\x41\x01\x03\x12-\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x19\n\x0b\x63hunk_count\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x19\n\x0b\x65vent_count\x18\x05 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\nsize_bytes\x18\x06 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x16\n\x08start_us\x18\x07 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x65nd_us\x18\x08 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\npose_count\x18\t \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x64igest\x18\n \x01(\tB\x04\xe2\x41\x01\x03\x12\x35\n\x0b\x63reate_time\x18\x0b \x01(\x0b\x32\x1a.google.protobuf.TimestampB\x04\xe2\x41\x01\x03\x12\x12\n\x04\x65tag\x18\x0c \x01(\tB\x04\xe2\x41\x01\x03\"C\n\x05State\x12\x15\n\x11STATE_UNSPECIFIED\x10\x00\x12\x0e\n\nSTATE_OPEN\x10\x01\x12\x13\n\x0fSTATE_FINALIZED\x10\x02\"\xa3\x01\n\x18\x43reateEventStreamRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1d\n\x0f\x65vent_stream_id\x18\x02 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x0c\x65vent_stream\x18\x03 \x01(\x0b\x32\x1c.roel_service.v1.EventStreamB\x04\xe2\x41\x01\x02\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"3\n\nEventChunk\x12\x11\n\x03seq\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x12\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\"c\n\x13\x41ppendEventsRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"m\n\x0c\x41ppendStatus\x12\x15\n\rcommitted_seq\x18\x01 \x01(\x03\x12\x15\n\rcredit_chunks\x18\x02 \x01(\x05\x12/\n\x07quality\x18\x03 \x01(\x0b\x32\x1e.roel_service.v1.AppendQuality\"U\n\rAppendQuality\x12\x15\n\revent_rate_hz\x18\x01 \x01(\x01\x12\x15\n\rpose_coverage\x18\x02 \x01(\x01\x12\x16\n\x0elongest_gap_us\x18\x03 \x01(\x03\".\n\x18QueryAppendStatusRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x12\x41ppendPosesRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05poses\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.TrajectoryH\x00\x42\x06\n\x04part\"^\n\x1a\x46inalizeEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x12\n\x04\x65tag\x18\x02 \x01(\tB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"+\n\x15GetEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x17ListEventStreamsRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x17\n\tpage_size\x18\x02 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x18\n\npage_token\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"h\n\x18ListEventStreamsResponse\x12\x33\n\revent_streams\x18\x01 \x03(\x0b\x32\x1c.roel_service.v1.EventStream\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\\\n\x18\x44\x65leteEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x12\n\x04\x65tag\x18\x02 \x01(\tB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"y\n\x11ReadEventsRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1b\n\x08start_us\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x01H\x00\x88\x01\x01\x12\x1a\n\x07stop_us\x18\x03 \x01(\x03\x42\x04\xe2\x41\x01\x01H\x01\x88\x01\x01\x42\x0b\n\t_start_usB\n\n\x08_stop_us\"Y\n\x14PreviewEventsRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x16\n\x08start_us\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x15\n\x07stop_us\x18\x03 \x01(\x03\x42\x04\xe2\x41\x01\x02\"9\n\x15PreviewEventsResponse\x12\x0b\n\x03png\x18\x01 \x01(\x0c\x12\x13\n\x0b\x65vent_count\x18\x02 \x01(\x03\"v\n\x18ImportEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12,\n\x04\x62lob\x18\x02 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x02\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\x32\x89\x08\n\x12\x45ventStreamService\x12\\\n\x11\x43reateEventStream\x12).roel_service.v1.CreateEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12W\n\x0c\x41ppendEvents\x12$.roel_service.v1.AppendEventsRequest\x1a\x1d.roel_service.v1.AppendStatus(\x01\x30\x01\x12]\n\x11QueryAppendStatus\x12).roel_service.v1.QueryAppendStatusRequest\x1a\x1d.roel_service.v1.AppendStatus\x12R\n\x0b\x41ppendPoses\x12#.roel_service.v1.AppendPosesRequest\x1a\x1c.roel_service.v1.EventStream(\x01\x12O\n\nReadEvents\x12\".roel_service.v1.ReadEventsRequest\x1a\x1b.roel_service.v1.EventChunk0\x01\x12^\n\rPreviewEvents\x12%.roel_service.v1.PreviewEventsRequest\x1a&.roel_service.v1.PreviewEventsResponse\x12]\n\x11ImportEventStream\x12).roel_service.v1.ImportEventStreamRequest\x1a\x1d.google.longrunning.Operation\x12`\n\x13\x46inalizeEventStream\x12+.roel_service.v1.FinalizeEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12V\n\x0eGetEventStream\x12&.roel_service.v1.GetEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12g\n\x10ListEventStreams\x12(.roel_service.v1.ListEventStreamsRequest\x1a).roel_service.v1.ListEventStreamsResponse\x12V\n\x11\x44\x65leteEventStream\x12).roel_service.v1.DeleteEventStreamRequest\x1a\x16.google.protobuf.Emptyb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1croel_service/v1/events.proto\x12\x0froel_service.v1\x1a\x1fgoogle/api/field_behavior.proto\x1a#google/longrunning/operations.proto\x1a\x1bgoogle/protobuf/empty.proto\x1a\x1fgoogle/protobuf/timestamp.proto\x1a\x1broel_service/v1/types.proto\"\xc9\x04\n\x0b\x45ventStream\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x03\x12\x37\n\x05state\x18\x02 \x01(\x0e\x32\".roel_service.v1.EventStream.StateB\x04\xe2\x41\x01\x03\x12-\n\x06\x63\x61mera\x18\x03 \x01(\x0b\x32\x17.roel_service.v1.CameraB\x04\xe2\x41\x01\x02\x12\x19\n\x0b\x63hunk_count\x18\x04 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x19\n\x0b\x65vent_count\x18\x05 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\nsize_bytes\x18\x06 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x16\n\x08start_us\x18\x07 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x65nd_us\x18\x08 \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x18\n\npose_count\x18\t \x01(\x03\x42\x04\xe2\x41\x01\x03\x12\x14\n\x06\x64igest\x18\n \x01(\tB\x04\xe2\x41\x01\x03\x12\x35\n\x0b\x63reate_time\x18\x0b \x01(\x0b\x32\x1a.google.protobuf.TimestampB\x04\xe2\x41\x01\x03\x12\x12\n\x04\x65tag\x18\x0c \x01(\tB\x04\xe2\x41\x01\x03\x12\x11\n\x03uid\x18\r \x01(\tB\x04\xe2\x41\x01\x03\x12>\n\x06labels\x18\x0e \x03(\x0b\x32(.roel_service.v1.EventStream.LabelsEntryB\x04\xe2\x41\x01\x01\x1a-\n\x0bLabelsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\"C\n\x05State\x12\x15\n\x11STATE_UNSPECIFIED\x10\x00\x12\x0e\n\nSTATE_OPEN\x10\x01\x12\x13\n\x0fSTATE_FINALIZED\x10\x02\"\xa3\x01\n\x18\x43reateEventStreamRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1d\n\x0f\x65vent_stream_id\x18\x02 \x01(\tB\x04\xe2\x41\x01\x02\x12\x38\n\x0c\x65vent_stream\x18\x03 \x01(\x0b\x32\x1c.roel_service.v1.EventStreamB\x04\xe2\x41\x01\x02\x12\x18\n\nrequest_id\x18\x04 \x01(\tB\x04\xe2\x41\x01\x01\"3\n\nEventChunk\x12\x11\n\x03seq\x18\x01 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x12\n\x04\x64\x61ta\x18\x02 \x01(\x0c\x42\x04\xe2\x41\x01\x02\"c\n\x13\x41ppendEventsRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05\x63hunk\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.EventChunkH\x00\x42\x06\n\x04part\"m\n\x0c\x41ppendStatus\x12\x15\n\rcommitted_seq\x18\x01 \x01(\x03\x12\x15\n\rcredit_chunks\x18\x02 \x01(\x05\x12/\n\x07quality\x18\x03 \x01(\x0b\x32\x1e.roel_service.v1.AppendQuality\"U\n\rAppendQuality\x12\x15\n\revent_rate_hz\x18\x01 \x01(\x01\x12\x15\n\rpose_coverage\x18\x02 \x01(\x01\x12\x16\n\x0elongest_gap_us\x18\x03 \x01(\x03\".\n\x18QueryAppendStatusRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x12\x41ppendPosesRequest\x12\x16\n\x0c\x65vent_stream\x18\x01 \x01(\tH\x00\x12,\n\x05poses\x18\x02 \x01(\x0b\x32\x1b.roel_service.v1.TrajectoryH\x00\x42\x06\n\x04part\"^\n\x1a\x46inalizeEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x12\n\x04\x65tag\x18\x02 \x01(\tB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"+\n\x15GetEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\"b\n\x17ListEventStreamsRequest\x12\x14\n\x06parent\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x17\n\tpage_size\x18\x02 \x01(\x05\x42\x04\xe2\x41\x01\x01\x12\x18\n\npage_token\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"h\n\x18ListEventStreamsResponse\x12\x33\n\revent_streams\x18\x01 \x03(\x0b\x32\x1c.roel_service.v1.EventStream\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\\\n\x18\x44\x65leteEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x12\n\x04\x65tag\x18\x02 \x01(\tB\x04\xe2\x41\x01\x01\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\"y\n\x11ReadEventsRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x1b\n\x08start_us\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x01H\x00\x88\x01\x01\x12\x1a\n\x07stop_us\x18\x03 \x01(\x03\x42\x04\xe2\x41\x01\x01H\x01\x88\x01\x01\x42\x0b\n\t_start_usB\n\n\x08_stop_us\"Y\n\x14PreviewEventsRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12\x16\n\x08start_us\x18\x02 \x01(\x03\x42\x04\xe2\x41\x01\x02\x12\x15\n\x07stop_us\x18\x03 \x01(\x03\x42\x04\xe2\x41\x01\x02\"9\n\x15PreviewEventsResponse\x12\x0b\n\x03png\x18\x01 \x01(\x0c\x12\x13\n\x0b\x65vent_count\x18\x02 \x01(\x03\"v\n\x18ImportEventStreamRequest\x12\x12\n\x04name\x18\x01 \x01(\tB\x04\xe2\x41\x01\x02\x12,\n\x04\x62lob\x18\x02 \x01(\x0b\x32\x18.roel_service.v1.BlobRefB\x04\xe2\x41\x01\x02\x12\x18\n\nrequest_id\x18\x03 \x01(\tB\x04\xe2\x41\x01\x01\x32\x89\x08\n\x12\x45ventStreamService\x12\\\n\x11\x43reateEventStream\x12).roel_service.v1.CreateEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12W\n\x0c\x41ppendEvents\x12$.roel_service.v1.AppendEventsRequest\x1a\x1d.roel_service.v1.AppendStatus(\x01\x30\x01\x12]\n\x11QueryAppendStatus\x12).roel_service.v1.QueryAppendStatusRequest\x1a\x1d.roel_service.v1.AppendStatus\x12R\n\x0b\x41ppendPoses\x12#.roel_service.v1.AppendPosesRequest\x1a\x1c.roel_service.v1.EventStream(\x01\x12O\n\nReadEvents\x12\".roel_service.v1.ReadEventsRequest\x1a\x1b.roel_service.v1.EventChunk0\x01\x12^\n\rPreviewEvents\x12%.roel_service.v1.PreviewEventsRequest\x1a&.roel_service.v1.PreviewEventsResponse\x12]\n\x11ImportEventStream\x12).roel_service.v1.ImportEventStreamRequest\x1a\x1d.google.longrunning.Operation\x12`\n\x13\x46inalizeEventStream\x12+.roel_service.v1.FinalizeEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12V\n\x0eGetEventStream\x12&.roel_service.v1.GetEventStreamRequest\x1a\x1c.roel_service.v1.EventStream\x12g\n\x10ListEventStreams\x12(.roel_service.v1.ListEventStreamsRequest\x1a).roel_service.v1.ListEventStreamsResponse\x12V\n\x11\x44\x65leteEventStream\x12).roel_service.v1.DeleteEventStreamRequest\x1a\x16.google.protobuf.Emptyb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'roel_service.v1.events_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
+  _globals['_EVENTSTREAM_LABELSENTRY']._loaded_options = None
+  _globals['_EVENTSTREAM_LABELSENTRY']._serialized_options = b'8\001'
   _globals['_EVENTSTREAM'].fields_by_name['name']._loaded_options = None
   _globals['_EVENTSTREAM'].fields_by_name['name']._serialized_options = b'\342A\001\003'
   _globals['_EVENTSTREAM'].fields_by_name['state']._loaded_options = None
@@ -60,6 +62,10 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_EVENTSTREAM'].fields_by_name['create_time']._serialized_options = b'\342A\001\003'
   _globals['_EVENTSTREAM'].fields_by_name['etag']._loaded_options = None
   _globals['_EVENTSTREAM'].fields_by_name['etag']._serialized_options = b'\342A\001\003'
+  _globals['_EVENTSTREAM'].fields_by_name['uid']._loaded_options = None
+  _globals['_EVENTSTREAM'].fields_by_name['uid']._serialized_options = b'\342A\001\003'
+  _globals['_EVENTSTREAM'].fields_by_name['labels']._loaded_options = None
+  _globals['_EVENTSTREAM'].fields_by_name['labels']._serialized_options = b'\342A\001\001'
   _globals['_CREATEEVENTSTREAMREQUEST'].fields_by_name['parent']._loaded_options = None
   _globals['_CREATEEVENTSTREAMREQUEST'].fields_by_name['parent']._serialized_options = b'\342A\001\002'
   _globals['_CREATEEVENTSTREAMREQUEST'].fields_by_name['event_stream_id']._loaded_options = None
@@ -113,41 +119,43 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_IMPORTEVENTSTREAMREQUEST'].fields_by_name['request_id']._loaded_options = None
   _globals['_IMPORTEVENTSTREAMREQUEST'].fields_by_name['request_id']._serialized_options = b'\342A\001\001'
   _globals['_EVENTSTREAM']._serialized_start=211
-  _globals['_EVENTSTREAM']._serialized_end=666
-  _globals['_EVENTSTREAM_STATE']._serialized_start=599
-  _globals['_EVENTSTREAM_STATE']._serialized_end=666
-  _globals['_CREATEEVENTSTREAMREQUEST']._serialized_start=669
-  _globals['_CREATEEVENTSTREAMREQUEST']._serialized_end=832
-  _globals['_EVENTCHUNK']._serialized_start=834
-  _globals['_EVENTCHUNK']._serialized_end=885
-  _globals['_APPENDEVENTSREQUEST']._serialized_start=887
-  _globals['_APPENDEVENTSREQUEST']._serialized_end=986
-  _globals['_APPENDSTATUS']._serialized_start=988
-  _globals['_APPENDSTATUS']._serialized_end=1097
-  _globals['_APPENDQUALITY']._serialized_start=1099
-  _globals['_APPENDQUALITY']._serialized_end=1184
-  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_start=1186
-  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_end=1232
-  _globals['_APPENDPOSESREQUEST']._serialized_start=1234
-  _globals['_APPENDPOSESREQUEST']._serialized_end=1332
-  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_start=1334
-  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_end=1428
-  _globals['_GETEVENTSTREAMREQUEST']._serialized_start=1430
-  _globals['_GETEVENTSTREAMREQUEST']._serialized_end=1473
-  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_start=1475
-  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_end=1573
-  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_start=1575
-  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_end=1679
-  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_start=1681
-  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_end=1773
-  _globals['_READEVENTSREQUEST']._serialized_start=1775
-  _globals['_READEVENTSREQUEST']._serialized_end=1896
-  _globals['_PREVIEWEVENTSREQUEST']._serialized_start=1898
-  _globals['_PREVIEWEVENTSREQUEST']._serialized_end=1987
-  _globals['_PREVIEWEVENTSRESPONSE']._serialized_start=1989
-  _globals['_PREVIEWEVENTSRESPONSE']._serialized_end=2046
-  _globals['_IMPORTEVENTSTREAMREQUEST']._serialized_start=2048
-  _globals['_IMPORTEVENTSTREAMREQUEST']._serialized_end=2166
-  _globals['_EVENTSTREAMSERVICE']._serialized_start=2169
-  _globals['_EVENTSTREAMSERVICE']._serialized_end=3202
+  _globals['_EVENTSTREAM']._serialized_end=796
+  _globals['_EVENTSTREAM_LABELSENTRY']._serialized_start=682
+  _globals['_EVENTSTREAM_LABELSENTRY']._serialized_end=727
+  _globals['_EVENTSTREAM_STATE']._serialized_start=729
+  _globals['_EVENTSTREAM_STATE']._serialized_end=796
+  _globals['_CREATEEVENTSTREAMREQUEST']._serialized_start=799
+  _globals['_CREATEEVENTSTREAMREQUEST']._serialized_end=962
+  _globals['_EVENTCHUNK']._serialized_start=964
+  _globals['_EVENTCHUNK']._serialized_end=1015
+  _globals['_APPENDEVENTSREQUEST']._serialized_start=1017
+  _globals['_APPENDEVENTSREQUEST']._serialized_end=1116
+  _globals['_APPENDSTATUS']._serialized_start=1118
+  _globals['_APPENDSTATUS']._serialized_end=1227
+  _globals['_APPENDQUALITY']._serialized_start=1229
+  _globals['_APPENDQUALITY']._serialized_end=1314
+  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_start=1316
+  _globals['_QUERYAPPENDSTATUSREQUEST']._serialized_end=1362
+  _globals['_APPENDPOSESREQUEST']._serialized_start=1364
+  _globals['_APPENDPOSESREQUEST']._serialized_end=1462
+  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_start=1464
+  _globals['_FINALIZEEVENTSTREAMREQUEST']._serialized_end=1558
+  _globals['_GETEVENTSTREAMREQUEST']._serialized_start=1560
+  _globals['_GETEVENTSTREAMREQUEST']._serialized_end=1603
+  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_start=1605
+  _globals['_LISTEVENTSTREAMSREQUEST']._serialized_end=1703
+  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_start=1705
+  _globals['_LISTEVENTSTREAMSRESPONSE']._serialized_end=1809
+  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_start=1811
+  _globals['_DELETEEVENTSTREAMREQUEST']._serialized_end=1903
+  _globals['_READEVENTSREQUEST']._serialized_start=1905
+  _globals['_READEVENTSREQUEST']._serialized_end=2026
+  _globals['_PREVIEWEVENTSREQUEST']._serialized_start=2028
+  _globals['_PREVIEWEVENTSREQUEST']._serialized_end=2117
+  _globals['_PREVIEWEVENTSRESPONSE']._serialized_start=2119
+  _globals['_PREVIEWEVENTSRESPONSE']._serialized_end=2176
+  _globals['_IMPORTEVENTSTREAMREQUEST']._serialized_start=2178
+  _globals['_IMPORTEVENTSTREAMREQUEST']._serialized_end=2296
+  _globals['_EVENTSTREAMSERVICE']._serialized_start=2299
+  _globals['_EVENTSTREAMSERVICE']._serialized_end=3332
 # @@protoc_insertion_point(module_scope)

@@ -16,7 +16,7 @@ from roel_service.errors import Cancelled, RoelError
 from roel_service.reasons import REASONS
 
 DOMAIN = "roel-service"
-# A status travels in headers, which gRPC refuses beyond 16 KiB: four texts of this length fit even
+# A status travels in headers, which gRPC refuses beyond 16 KiB: six texts of this length fit even
 # when every character takes four bytes and the headers' encodings add to that.
 MAX_TEXT_LENGTH = 300
 
@@ -75,6 +75,11 @@ def status_from_error(error: RoelError | Cancelled) -> status_pb2.Status:
     message = str(error)[:MAX_TEXT_LENGTH]
     status = status_pb2.Status(code=code_of(type(error)), message=message)
     status.details.add().Pack(info)
+    if isinstance(error, errors.InputError):
+        bad = error_details_pb2.BadRequest()
+        violation = bad.field_violations.add(field=info.metadata["subject"])
+        violation.description = f"expected {error.expected}, found {error.found}"[:MAX_TEXT_LENGTH]
+        status.details.add().Pack(bad)
     row = REASONS.get(error.reason)
     if row is not None and row.retry_after_s is not None:
         retry = error_details_pb2.RetryInfo()

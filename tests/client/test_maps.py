@@ -62,8 +62,9 @@ def test_what_people_call_a_map_is_changed(client):
 def test_recordings_and_operations_are_listed(client, versions):
     name = client.map_version(versions[0]).operation
     assert name in {item.name for item in client.operations()}
-    stream = client.create_event_stream(new_id(), CAMERA)
-    assert stream in {item.name for item in client.event_streams()}
+    stream = client.create_event_stream(new_id(), CAMERA, {"robot": "r2"})
+    listed = {item.name: item for item in client.event_streams()}
+    assert (dict(listed[stream].labels), len(listed[stream].uid)) == ({"robot": "r2"}, 32)
 
 
 def test_a_deleted_version_comes_back_as_it_was(client, versions):

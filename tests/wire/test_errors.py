@@ -1,5 +1,5 @@
 import pytest
-from google.rpc import code_pb2, status_pb2
+from google.rpc import code_pb2, error_details_pb2, status_pb2
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -47,6 +47,14 @@ def test_codes_are_those_of_the_design(kind, code):
     assert status_from_error(kind("s", "e", "f")).code == code
 
 
+def test_a_bad_input_is_told_as_the_standard_has_it_too():
+    status = status_from_error(InputError("page_size", "a size", "-1", reason="PAGE_SIZE_INVALID"))
+    bad = error_details_pb2.BadRequest()
+    assert status.details[1].Unpack(bad)
+    (violation,) = bad.field_violations
+    assert (violation.field, violation.description) == ("page_size", "expected a size, found -1")
+
+
 def test_an_error_of_no_particular_reason_has_that_of_its_class():
     assert errors.NoAnswerError("map", "lines", "none").reason == "NO_ANSWER"
     assert InputError("--host", "a host", "none").reason == "INPUT_INVALID"
@@ -64,7 +72,8 @@ def test_cancelled_comes_back_as_cancelled():
 
 def test_long_texts_are_cut_to_fit_a_header():
     status = status_from_error(InputError(*("\U0001f600" * 10_000,) * 3))
-    assert status.ByteSize() < 5000
+    # In base64, beside the message once more with three characters for a byte: below 16 KiB.
+    assert status.ByteSize() * 4 / 3 + 3 * len(status.message.encode()) < 2**14
     assert error_from_status(status).found == "\U0001f600" * MAX_TEXT_LENGTH
 
 

@@ -21,6 +21,7 @@ from roel_service.store.migrations import (
     m008_results,
     m009_undeleted_versions,
     m010_owners,
+    m011_labels_of_recordings,
 )
 
 # Step k leads from version k to k + 1.
@@ -35,6 +36,7 @@ MIGRATIONS: tuple[Callable[[Connection], None], ...] = (
     m008_results.migrate,
     m009_undeleted_versions.migrate,
     m010_owners.migrate,
+    m011_labels_of_recordings.migrate,
 )
 
 
