@@ -16,7 +16,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m roel_crash")
     parser.add_argument("--kills", type=int, default=210)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, help="the outcome as JSON")
+    parser.add_argument("--out", type=Path, help="a JSON list, to which the outcome is added")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         with Path(folder, "server.log").open("ab") as log:
@@ -25,7 +25,8 @@ def main() -> int:
         if outcome.broken:
             print(Path(folder, "server.log").read_text()[-20_000:], file=sys.stderr)
     if options.out is not None:
-        options.out.write_text(text + "\n")
+        earlier = json.loads(options.out.read_text()) if options.out.exists() else []
+        options.out.write_text(json.dumps([*earlier, outcome.document()], indent=1) + "\n")
     print(text)
     return 1 if outcome.broken or outcome.missed else 0
 

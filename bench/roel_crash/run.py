@@ -24,8 +24,10 @@ STEP_TIMEOUT_S = 15.0
 # Steps that are met at every start, and one that ends an operation when every attempt dies there:
 # now and then one is survived.
 SURVIVED = {"rows.written": 0.1, "rows.committed": 0.1, "stage.cached": 0.5}
-# So often a step is tried again that was never met.
-RETRY_COUNT = 8
+# A run that is long enough for it goes on until every named step was met so often, and as many kills
+# struck as were asked for; at most for so many kills more.
+LEAST_STEP_KILLS = 3
+MAX_EXTRA_KILLS = 60
 LONGEST_LIFE_S = 2.5
 
 CHECKER_COUNT = 2
@@ -134,13 +136,12 @@ def crash(
     for checker in checkers:
         checker.start()
     kills = deque(plan(kill_count, rng))
-    retry_count = RETRY_COUNT if kill_count >= 3 * len(FAILPOINTS) else 0
+    most_kills = kill_count + MAX_EXTRA_KILLS
     while kills:
         kill = kills.popleft()
         outcome.kills[kill.name if kill.strike(victim) else f"{kill.name}{NOT_MET}"] += 1
-        if not kills and retry_count:
-            retry_count -= 1
-            kills += (again for step in outcome.missed for again in _retries(step, rng))
+        if not kills and outcome.kills.total() < most_kills:
+            kills += _missing(outcome, kill_count, rng)
         following = kills[0].failpoint if kills else ""
         if victim.is_dead_within(0):
             outcome.broken += check_folder(folder).problems
@@ -163,9 +164,13 @@ def crash(
     return outcome
 
 
-def _retries(step: str, rng: random.Random) -> tuple[Kill, Kill]:
-    """A step once more, with the server's death that has to come before it."""
-    return _kill_of_server(rng), _kill_at_step(step)
+def _missing(outcome: Outcome, kill_count: int, rng: random.Random) -> list[Kill]:
+    """What a run that was to have so many kills lacks; each step after a server's death."""
+    each_count = min(LEAST_STEP_KILLS, kill_count // (3 * len(FAILPOINTS)))
+    scarce = [step for step in FAILPOINTS if outcome.kills[step] < each_count]
+    if scarce:
+        return [kill for step in scarce for kill in (_kill_of_server(rng), _kill_at_step(step))]
+    return [_kill_of_server(rng)] if outcome.kill_count < kill_count else []
 
 
 def _unended(folder: Path, ledger: Ledger) -> list[str]:

@@ -1,6 +1,6 @@
 """What the server adds to Register and Localize: the same questions in process and through it.
 
-    python -m roel_load.interactive MAP.rlm --cloud FILE --panoramas FILE ... [--calls 20] [--callers 2]
+    python -m roel_load.interactive MAP.rlm --cloud FILE --panoramas FILE ... [--calls 10] [--callers 2]
 
 In process everything is prepared once, then asked one question after the other. Through the server
 the first call pays for the start of a child and for the preparation; then one caller asks, for the
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("map", type=Path)
     parser.add_argument("--cloud", type=Path, required=True)
     parser.add_argument("--panoramas", type=Path, nargs="+", required=True)
-    parser.add_argument("--calls", type=int, default=20)
+    parser.add_argument("--calls", type=int, default=10)
     parser.add_argument("--callers", type=int, default=2)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
