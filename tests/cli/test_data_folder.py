@@ -2,9 +2,10 @@ import json
 
 import pytest
 
-from roel_client import local
 from roel_client.cli.main import main
+from roel_client.local import data_folder
 from roel_service.errors import NoAnswerError
+from roel_service.store import schema
 from roel_service.store.store import Store
 
 
@@ -21,17 +22,16 @@ def test_a_sound_folder_is_told_so(folder, capfd):
 
 
 def test_problems_are_an_answer_of_their_own(folder, capfd):
+    lost = {column.name: column.type.python_type() for column in schema.OPERATION.columns}
+    lost |= {"id": "o", "method": "BuildMap", "map_id": "house", "version": 1, "state": "queued"}
     with Store(folder) as store, store._database.write() as connection:
-        connection.exec_driver_sql(
-            "INSERT INTO operation SELECT 'o', 'BuildMap', '', 'house', 1, 'walk', 'queued', '',"
-            " 0, 0, 0, x'', x'', x'', 1, 1, 0, 0, ''"
-        )
+        connection.execute(schema.OPERATION.insert().values(lost))
     assert main(["admin", "fsck", "--data", str(folder), "--json"]) == 3
     printed = capfd.readouterr()
     assert json.loads(printed.out)["problems"]
     assert printed.err.startswith("roel: no answer: ")
     with pytest.raises(NoAnswerError) as caught:
-        local.check_data(str(folder))
+        data_folder.check_data(str(folder))
     assert caught.value.reason == "DATA_UNSOUND"
 
 

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
-from roel_client import local
 from roel_client.cli.localize import METHODS, localize
 from roel_client.cli.main import parser
 from roel_client.cli.parser import UsageError
+from roel_client.local import localization
 from roel_service.config.stages import LocalizeConfig
 from roel_service.errors import NoAnswerError
 from roel_service.evaluation.poses import rotation_errors_rad, translation_errors_m
@@ -96,7 +96,7 @@ def test_unusable_inputs_end_with_2_and_one_line(folder, arguments, message):
 
 @pytest.mark.parametrize("preset", ["paper", "fgpl-released"])
 def test_fgpl_gets_the_same_keys_and_a_verdict(folder, preset):
-    (document,) = local.localize_panoramas(
+    (document,) = localization.localize_panoramas(
         [str(folder / "map.npz")],
         [str(folder / "black.jpg")],
         method=METHODS[preset],

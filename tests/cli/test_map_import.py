@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from roel_client.local import read_map_file
+from roel_client.local.maps import read_map_file
 from tests.register.rooms import room_map
 
 ROEL = Path(sys.executable).with_name("roel")

@@ -42,7 +42,7 @@ def test_starting_the_command_line_loads_no_other_library() -> None:
 
 def test_no_module_of_the_client_loads_an_algorithm() -> None:
     names = modules_of(list(roel_client.__path__), "roel_client.")
-    assert "roel_client.local" in names
+    assert "roel_client.local.maps" in names
     assert not loaded_by(*names) & ALGORITHMS
 
 

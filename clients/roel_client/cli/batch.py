@@ -57,14 +57,14 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def localize(options: argparse.Namespace, staged: Staged) -> None:
     """Locate the panoramas of a manifest, and print how many were found."""
-    from roel_client import local
+    from roel_client.local import batches
 
     server = None
     if options.server is not None:
         server = (options.server, server_options(options))
     # A signal must reach the children, and the server that hosts the maps.
     with interruptible(), progress_bar() as progress:
-        counts = local.localize_batch(
+        counts = batches.localize_batch(
             options.manifest,
             options.maps,
             options.out,

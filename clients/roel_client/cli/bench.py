@@ -65,12 +65,12 @@ def _add_mapping(group: Subparsers) -> None:
 
 def bench_mapping(options: argparse.Namespace, staged: Staged) -> None:
     """Run a suite and print its rows."""
-    from roel_client import local
+    from roel_client.local import benchmarks
 
     out = Path(options.out)
     data = options.data or os.environ.get("ROEL_DATA")
     with progress_bar() as progress:
-        document, text = local.bench_mapping(
+        document, text = benchmarks.bench_mapping(
             out,
             suite=options.suite,
             scenes=tuple(options.scenes) if options.scenes else None,
@@ -128,10 +128,10 @@ def _add_trial_options(parser: argparse.ArgumentParser) -> None:
 
 def bench_registration(options: argparse.Namespace, staged: Staged) -> None:
     """Run all protocols on all places and print their tables."""
-    from roel_client import local
+    from roel_client.local import benchmarks
 
     with progress_bar() as progress:
-        document, text = local.bench_registration(
+        document, text = benchmarks.bench_registration(
             Path(options.out),
             rooms=[(line_map, cloud) for line_map, cloud in options.place],
             has_large=options.large,
@@ -182,10 +182,10 @@ def _add_localization(group: Subparsers) -> None:
 
 def bench_localization(options: argparse.Namespace, staged: Staged) -> None:
     """Run the protocols on all places and print their tables."""
-    from roel_client import local
+    from roel_client.local import benchmarks
 
     with progress_bar() as progress:
-        document, text = local.bench_localization(
+        document, text = benchmarks.bench_localization(
             Path(options.out),
             rooms=[(line_map, folder) for line_map, folder in options.room],
             house=tuple(options.house) if options.house else None,
@@ -234,11 +234,11 @@ def _add_poses(group: Subparsers) -> None:
 
 def bench_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Run the benchmark of poses and print its page."""
-    from roel_client import local
+    from roel_client.local import benchmarks
 
     data = options.data or os.environ.get("ROEL_DATA")
     with progress_bar() as progress:
-        document, text = local.bench_poses(
+        document, text = benchmarks.bench_poses(
             Path(options.out),
             rooms=tuple(options.scenes),
             seed_count=options.draws,

@@ -33,25 +33,25 @@ def _add_options(parser: Parser) -> None:
 
 def check(options: argparse.Namespace, staged: Staged) -> None:
     """Say whether a data folder is sound."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
-    findings = local.check_data(options.data)
+    findings = data_folder.check_data(options.data)
     print_result(findings, f"{options.data}: sound; {_size(findings)}", as_json=options.json)
 
 
 def back_up(options: argparse.Namespace, staged: Staged) -> None:
     """Copy a data folder, and check the copy."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
-    findings = local.back_up_data(options.data, staged["out"])
+    findings = data_folder.back_up_data(options.data, staged["out"])
     print_result(findings, f"{options.out}: {_size(findings)}", as_json=options.json)
 
 
 def collect_garbage(options: argparse.Namespace, staged: Staged) -> None:
     """Delete what nobody needs any more."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
-    swept = local.collect_garbage(options.data)
+    swept = data_folder.collect_garbage(options.data)
     text = (
         f"{options.data}: deleted {swept['deleted_blob_count']} files of"
         f" {swept['deleted_bytes']} bytes, kept {swept['kept_blob_count']}"

@@ -29,24 +29,24 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def demo(options: argparse.Namespace, staged: Staged) -> None:
     """Run the whole chain on a simulated room."""
-    from roel_client import local
+    from roel_client.local import building, evaluation, recordings, registration, simulation
 
     folder = staged.get("out", staged["scratch"])
     room = folder / "room"
     folder.mkdir(exist_ok=True)
     with progress_bar() as progress:
-        local.simulate(room, SEED, progress, seconds=SECONDS, panorama_count=0)
-    recording = local.open_recording(
+        simulation.simulate(room, SEED, progress, seconds=SECONDS, panorama_count=0)
+    recording = recordings.open_recording(
         str(room / "events.h5"), str(room / "poses.txt"), str(room / "camera.json"), None
     )
     with progress_bar() as progress:
-        built = local.build_map(recording, load_config("default"), progress)
+        built = building.build_map(recording, load_config("default"), progress)
     (folder / "map.rlm").write_bytes(built.rlm_bytes)
     (folder / "report.json").write_text(to_json(built.report) + "\n", encoding="utf-8")
-    local.draw_map(built, recording, folder / "map.png")
+    building.draw_map(built, recording, folder / "map.png")
     truth = str(room / "gt.npz")
-    figures = local.evaluate_map(str(folder / "map.rlm"), truth, truth)
-    registration = local.register_map(
+    figures = evaluation.evaluate_map(str(folder / "map.rlm"), truth, truth)
+    registered = registration.register_map(
         str(folder / "map.rlm"),
         str(room / "cloud.npz"),
         init=None,
@@ -58,7 +58,7 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
     document = {
         "report": built.report,
         "evaluation": figures,
-        "registration": registration,
+        "registration": registered,
         "picture": picture,
     }
     print_result(document, _told(document), as_json=options.json)

@@ -27,9 +27,9 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def evaluate_map(options: argparse.Namespace, staged: Staged) -> None:
     """Print how far a map is from the truth."""
-    from roel_client import local
+    from roel_client.local import evaluation
 
-    figures = local.evaluate_map(options.map, options.mesh, options.edges)
+    figures = evaluation.evaluate_map(options.map, options.mesh, options.edges)
     print_result(figures, told(figures), as_json=options.json)
 
 

@@ -73,7 +73,7 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def localize(options: argparse.Namespace, staged: Staged) -> None:
     """Locate panoramas, and print where each was taken as soon as it is known."""
-    from roel_client import local
+    from roel_client.local import localization
 
     method = METHODS[options.preset]
     if options.camera is not None:
@@ -89,7 +89,7 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
         "overlay": staged.get("overlay"),
     }
     if options.server is None:
-        documents = local.localize_panoramas(
+        documents = localization.localize_panoramas(
             maps, options.panoramas, method=method, camera=options.camera, **asked
         )
         report(documents, options)
@@ -98,7 +98,8 @@ def localize(options: argparse.Namespace, staged: Staged) -> None:
     # A signal must reach the client, which then takes what it hosted away.
     with interruptible():
         report(
-            local.localize_panoramas_remotely(maps, options.panoramas, **asked, **server), options
+            localization.localize_panoramas_remotely(maps, options.panoramas, **asked, **server),
+            options,
         )
 
 

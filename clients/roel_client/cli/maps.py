@@ -90,32 +90,32 @@ def add_recording_options(parser: Parser) -> None:
 
 def build_map(options: argparse.Namespace, staged: Staged) -> None:
     """Build a map here or on a server, and write it with its report and picture."""
-    from roel_client import local
+    from roel_client.local import building, recordings
 
     started_s = time.perf_counter()
     if options.poses_out is not None:
         _check_poses_out(options)
     config = effective_config(options, {**seed_table(options), **poses_table(options)})
-    recording = local.open_recording(
+    recording = recordings.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
         if options.server is None:
-            built = local.build_map(recording, config, progress)
+            built = building.build_map(recording, config, progress)
         else:
             # A signal must reach the client, which then ends the build on the server too.
             with interruptible():
-                built = local.build_map_remotely(
+                built = building.build_map_remotely(
                     recording, config, progress, options.server, server_options(options)
                 )
     staged["out"].write_bytes(built.rlm_bytes)
     if "poses_out" in staged:
-        local.write_poses(built.trajectory or recording.trajectory, staged["poses_out"])
+        recordings.write_poses(built.trajectory or recording.trajectory, staged["poses_out"])
     report = {**built.report, "seconds_total": time.perf_counter() - started_s}
     if "report" in staged:
         staged["report"].write_text(to_json(report) + "\n", encoding="utf-8")
     if "plot" in staged:
-        local.draw_map(built, recording, staged["plot"])
+        building.draw_map(built, recording, staged["plot"])
     print_result(report, _told(report, options.out), as_json=options.json)
 
 
@@ -146,9 +146,9 @@ def _add_info(group: Subparsers) -> None:
 
 def show_info(options: argparse.Namespace, staged: Staged) -> None:
     """Print what a map file holds."""
-    from roel_client import local
+    from roel_client.local import maps
 
-    info = local.describe_map(options.map)
+    info = maps.describe_map(options.map)
     text = "\n".join(f"{key:<16}{_shown(value)}" for key, value in info.items())
     print_result(info, text, as_json=options.json)
 
@@ -172,9 +172,9 @@ def _add_import(group: Subparsers) -> None:
 
 def import_map(options: argparse.Namespace, staged: Staged) -> None:
     """Write lines of another program as a map file."""
-    from roel_client import local
+    from roel_client.local import maps
 
-    name, kept_count, dropped_count = local.import_map(options.lines, staged["out"])
+    name, kept_count, dropped_count = maps.import_map(options.lines, staged["out"])
     dropped = f", {dropped_count} without length left out" if dropped_count else ""
     print_result({}, f"{options.out}: {kept_count} lines from {name}{dropped}", as_json=False)
 
@@ -194,6 +194,6 @@ def _add_export(group: Subparsers) -> None:
 
 def export_map(options: argparse.Namespace, staged: Staged) -> None:
     """Write a map in the format that the output's suffix names."""
-    from roel_client import local
+    from roel_client.local import maps
 
-    local.export_map(options.map, Path(staged["out"]))
+    maps.export_map(options.map, Path(staged["out"]))

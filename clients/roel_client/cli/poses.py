@@ -50,17 +50,17 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Refine the poses of a recording, and write them at their own times."""
-    from roel_client import local
+    from roel_client.local import poses, recordings
 
     if options.estimate_time_offset and options.server is not None:
         raise UsageError("--estimate-time-offset", "no --server beside it", options.server)
     config = effective_config(options, seed_table(options))
-    recording = local.open_recording(
+    recording = recordings.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
     )
     with progress_bar() as progress:
         if options.server is None:
-            result, refined = local.refine_poses(
+            result, refined = poses.refine_poses(
                 recording,
                 options.map,
                 config,
@@ -71,7 +71,7 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
         else:
             # A signal must reach the client, which then ends the work on the server too.
             with interruptible():
-                result, refined = local.refine_poses_remotely(
+                result, refined = poses.refine_poses_remotely(
                     recording,
                     options.map,
                     config,
@@ -81,7 +81,7 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
                     options=server_options(options),
                 )
     if "plot" in staged:
-        local.draw_poses(recording, refined, options.truth, staged["plot"])
+        poses.draw_poses(recording, refined, options.truth, staged["plot"])
     print_result(result, _told(result, options.out), as_json=options.json)
 
 

@@ -47,7 +47,7 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def register(options: argparse.Namespace, staged: Staged) -> None:
     """Register a map, and print where it lies."""
-    from roel_client import local
+    from roel_client.local import registration
 
     if options.method == "global" and options.init is not None:
         raise UsageError("--init", "no first guess with --method global", options.init)
@@ -58,12 +58,14 @@ def register(options: argparse.Namespace, staged: Staged) -> None:
         "plot": staged.get("plot"),
     }
     if options.server is None:
-        found = local.register_map(options.map, options.cloud, **asked)
+        found = registration.register_map(options.map, options.cloud, **asked)
     else:
         server = {"server": options.server, "options": server_options(options)}
         # A signal must reach the client, which then takes what it hosted away.
         with interruptible():
-            found = local.register_map_remotely(options.map, options.cloud, **asked, **server)
+            found = registration.register_map_remotely(
+                options.map, options.cloud, **asked, **server
+            )
     if options.strict and found["verdict"] != ACCEPTED:
         raise NoAnswerError(
             options.map,

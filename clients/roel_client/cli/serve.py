@@ -53,11 +53,11 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def serve(options: argparse.Namespace, staged: Staged) -> None:
     """Serve until SIGINT or SIGTERM; one JSON line on stdout says when and where."""
-    from roel_client import local
+    from roel_client.local import serving
 
     listen = {
         name: getattr(options, name)
         for name in ("host", "port", "tls_cert", "tls_key", "client_ca", "insecure", "admin")
     }
-    with local.log_format(options.log_format):
-        local.serve(Path(options.data), listen, lambda addresses: print_text(to_json(addresses)))
+    with serving.log_format(options.log_format):
+        serving.serve(Path(options.data), listen, lambda addresses: print_text(to_json(addresses)))

@@ -45,7 +45,7 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def simulate(options: argparse.Namespace, staged: Staged) -> None:
     """Render a scene along a trajectory and write what the sensor would have sent."""
-    from roel_client import local
+    from roel_client.local import simulation
 
     names = (
         "seconds",
@@ -60,5 +60,5 @@ def simulate(options: argparse.Namespace, staged: Staged) -> None:
     if options.mesh is not None:
         given["mesh"] = Path(options.mesh)
     with progress_bar() as progress:
-        event_count = local.simulate(staged["out"], options.seed, progress, **given)
+        event_count = simulation.simulate(staged["out"], options.seed, progress, **given)
     print_text(f"{options.out}: {event_count} events")

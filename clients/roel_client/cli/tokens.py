@@ -60,23 +60,25 @@ def _token_command(group: Subparsers, name: str, summary: str, run: Any) -> Any:
 
 def make_token(options: argparse.Namespace, staged: Staged) -> None:
     """Print a new token."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
     quota = {
         "stored_bytes": options.max_gib and options.max_gib * GIB,
         "event_streams": options.max_recordings,
         "unfinished_operations": options.max_operations,
     }
-    token = local.create_token(Path(options.data), options.name, options.role, options.days, quota)
+    token = data_folder.create_token(
+        Path(options.data), options.name, options.role, options.days, quota
+    )
     told = {"name": options.name, "role": options.role, "token": token}
     print_result(told, token, as_json=options.json)
 
 
 def list_tokens(options: argparse.Namespace, staged: Staged) -> None:
     """Print who may call."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
-    callers = local.list_tokens(Path(options.data))
+    callers = data_folder.list_tokens(Path(options.data))
     lines = [
         f"{item['name']:<24}{item['role']:<16}{item['expires'] or 'never':<28}{_limits(item['quota'])}"
         for item in callers
@@ -92,9 +94,9 @@ def _limits(quota: dict[str, int | None]) -> str:
 
 def revoke_token(options: argparse.Namespace, staged: Staged) -> None:
     """Make a caller nobody."""
-    from roel_client import local
+    from roel_client.local import data_folder
 
-    local.revoke_token(Path(options.data), options.name)
+    data_folder.revoke_token(Path(options.data), options.name)
     print_result(
         {"name": options.name}, f"{options.name} is let in no longer", as_json=options.json
     )

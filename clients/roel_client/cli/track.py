@@ -53,10 +53,10 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def track(options: argparse.Namespace, staged: Staged) -> None:
     """Follow the camera of a recording, and print each pose as soon as it is known."""
-    from roel_client import local
+    from roel_client.local import tracking
 
     config = effective_config(options, seed_table(options))
-    poses = local.TrackedRecording(
+    poses = tracking.TrackedRecording(
         options.map, options.events, options.camera, options.sensor_size, options.init, config
     )
     counts: Counter[str] = Counter()

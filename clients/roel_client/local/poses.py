@@ -1,0 +1,112 @@
+"""The poses of a recording are refined, here or on a server."""
+
+from __future__ import annotations
+
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from roel_client.local.maps import hosted, read_map
+from roel_client.local.recordings import Recording, write_poses
+from roel_service.naming import naming
+
+if TYPE_CHECKING:
+    from roel_service.config.stages import Config
+    from roel_service.progress import ProgressCallback
+    from roel_service.scene.trajectory import Trajectory
+
+
+def refine_poses(
+    recording: Recording,
+    map_name: str | None,
+    config: Config,
+    out: Path,
+    *,
+    estimate_time_offset: bool,
+    progress: ProgressCallback,
+) -> tuple[dict[str, Any], Trajectory]:
+    """Refine the poses of a recording, with its own lines or in a map, and write them.
+
+    Returns:
+        What `roel refine-poses` prints, and the poses.
+
+    Raises:
+        NoAnswerError: too few lines.
+        RoelError: whatever reading and refining raise.
+    """
+    from roel_service.jobs import refinement
+
+    started_s = time.perf_counter()
+    line_map = None if map_name is None else read_map(map_name)
+    with naming(recording.names):
+        trajectory, report = refinement.refine_poses(
+            recording.events,
+            recording.trajectory,
+            recording.camera,
+            config,
+            line_map=line_map,
+            estimate_time_offset=estimate_time_offset,
+            progress=progress,
+        )
+    write_poses(trajectory, out)
+    return {**report, "seconds": time.perf_counter() - started_s}, trajectory
+
+
+def refine_poses_remotely(
+    recording: Recording,
+    map_name: str | None,
+    config: Config,
+    out: Path,
+    progress: ProgressCallback,
+    *,
+    server: str,
+    options: dict[str, Any],
+) -> tuple[dict[str, Any], Trajectory]:
+    """Let a server refine the poses; as `refine_poses`.
+
+    Args:
+        map_name: a file, or a version that the server has.
+        server: `HOST:PORT`.
+        options: arguments of `Client` beside the address.
+    """
+    from roel_client.client import Client
+
+    started_s = time.perf_counter()
+    with ExitStack() as resources:
+        resources.enter_context(naming(recording.names))
+        client = resources.enter_context(Client(server, **options))
+        version = None
+        if map_name is not None:
+            version = resources.enter_context(hosted(client, map_name))
+        trajectory, answer = client.refine_recording(
+            recording.events, recording.trajectory, recording.camera, config, version, progress
+        )
+    write_poses(trajectory, out)
+    has_sigma = answer.HasField("time_offset_sigma_us")
+    result = {
+        "pose_count": answer.pose_count,
+        "line_count": answer.line_count,
+        "iterations": answer.iteration_count,
+        "converged": answer.converged,
+        "cost_initial": answer.cost_initial,
+        "cost_final": answer.cost_final,
+        "mean_shift_m": answer.mean_shift_m,
+        "mean_turn_deg": answer.mean_turn_deg,
+        "time_offset_us": answer.time_offset_us,
+        "time_offset_sigma_us": answer.time_offset_sigma_us if has_sigma else None,
+        "problems": list(answer.problems),
+        "seconds": time.perf_counter() - started_s,
+    }
+    return result, trajectory
+
+
+def draw_poses(
+    recording: Recording, refined: Trajectory, truth_name: str | None, path: Path
+) -> None:
+    """Write the picture of given and refined poses, and of the true ones if there are any."""
+    from roel_service.evaluation import pose_figures
+    from roel_service.io.poses import read_trajectory
+
+    truth = None if truth_name is None else read_trajectory(Path(truth_name))
+    pose_figures.draw_trajectories(recording.trajectory, refined, truth, path)
