@@ -31,6 +31,8 @@ ROOM, HOUSE_ROOM, HOUSE, HOUSE_OUTSIDE, SYMMETRIC = (
     "symmetric",
 )
 MAX_POSES_BYTES = 1 << 20
+# Ends the name of a room whose map's lines were cut in pieces, to have a map of many lines.
+IN_PIECES = "_in_pieces"
 
 SYMMETRIC_SEED = 401
 SYMMETRIC_PANORAMA_COUNT = 4
@@ -78,7 +80,7 @@ class Place:
 def room(name: str, line_map: LineMap, folder: Path) -> Place:
     """A map of a room and a folder of panoramas as `roel simulate` writes it."""
     panoramas = tuple(panorama for _, panorama in _panoramas(folder))
-    is_tuning = name in TUNING_PLACES
+    is_tuning = name.removesuffix(IN_PIECES) in TUNING_PLACES
     return Place(name=name, kind=ROOM, line_map=line_map, panoramas=panoramas, is_tuning=is_tuning)
 
 
