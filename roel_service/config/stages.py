@@ -363,6 +363,8 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         free_poses: refine the poses together with the lines, then map with the refined ones.
         pose_gates_px: with free poses, distance within which lines take up observations, one value
             a round of matching and refinement.
+        pose_turn_deg: how far the given poses may be turned against one another; the first gates are
+            widened to what that moves in the picture.
         pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
         pose_interval_us: control points of the poses' correction are so far apart.
         pose_loss_scale_px: residual at which the Cauchy loss of lines and poses starts to bend, at the
@@ -379,6 +381,7 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
     corner_depth_m: float = parameter(0.03, POSITIVE)
     free_poses: bool = False
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.0, 1.3), SOME_POSITIVE)
+    pose_turn_deg: float = parameter(0.78, POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)
     pose_interval_us: int = parameter(100_000, POSITIVE)
     pose_loss_scale_px: float = parameter(0.15, POSITIVE)

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from roel_service.arrays import FloatArray
-from roel_service.config.stages import Config, RefineRoundsConfig
+from roel_service.config.stages import Config, RefineConfig, RefineRoundsConfig
 from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_points, align_poses
@@ -271,10 +271,25 @@ def _problems(
     return tuple(problem for problem, there in is_there.items() if there)
 
 
+def gates_px(config: RefineConfig, focal_px: float) -> list[float]:
+    """Gates of the rounds: the last as it is, the first wide enough for what the poses are turned.
+
+    Lines that are seen again at the end of a recording close its loop. A first gate in pixels alone
+    leaves them out where pixels are small against what the given poses are turned.
+    """
+    given_px = np.array(config.pose_gates_px)
+    turn_px = np.radians(config.pose_turn_deg) * focal_px
+    above_last = np.log(given_px / given_px[-1])
+    if above_last[0] > 0.0:
+        widest = np.log(max(given_px[0], turn_px) / given_px[-1])
+        above_last *= widest / above_last[0]
+    return list(given_px[-1] * np.exp(above_last))
+
+
 def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined:
     """Lines of neighbouring frames, triangulated as well as the poses allow."""
-    first_px = config.refine.pose_gates_px[0]
     frames, evidence = detected.frames, detected.evidence
+    first_px = gates_px(config.refine, frames.focal_px)[0]
     local = config.match_local
     reach_px = max(local.max_distance_px, first_px + MATCH_MARGIN_PX)
     with run.stage("match_local"):
@@ -316,7 +331,7 @@ def _with_own_lines(
     )
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
-    for gate_px in config.refine.pose_gates_px:
+    for gate_px in gates_px(config.refine, detected.frames.focal_px):
         gated = _with_gate(config, gate_px)
         with run.stage("match_global"):
             frames, evidence = _seen_with(detected, correction)
@@ -357,10 +372,10 @@ def _in_map(
     """Rounds of matching with the poses as they are, and of refining them alone."""
     direction, moment = plucker.plucker_from_endpoints(line_map.segments)
     lines = InfiniteLines(direction=direction, moment=moment)
-    gates_px = config.refine.pose_gates_px
+    given_px = config.refine.pose_gates_px
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
-    for gate_px in (*(wider * gates_px[0] for wider in MAP_GATES), *gates_px):
+    for gate_px in (*(wider * given_px[0] for wider in MAP_GATES), *given_px):
         gated = _with_gate(config, gate_px)
         with run.stage("match_global"):
             frames, evidence = _seen_with(detected, correction)

@@ -3,12 +3,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from roel_service.config.stages import RefineConfig
 from roel_service.errors import Cancelled, NoAnswerError
 from roel_service.evaluation.poses import trajectory_errors, translation_errors_m
 from roel_service.geometry.alignment import align_points
 from roel_service.mapping import pose_windows
 from roel_service.mapping.pipeline import build_line_map
-from roel_service.mapping.refine_poses import refine_poses
+from roel_service.mapping.refine_poses import gates_px, refine_poses
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseProblem
 from roel_service.scene.trajectory import Trajectory
@@ -165,3 +166,18 @@ def test_it_can_be_cancelled(noisy):
 
     with pytest.raises(Cancelled):
         refine_poses(event_stream(), noisy, CAMERA, CONFIG, progress=cancel)
+
+
+@pytest.mark.parametrize(
+    ("focal_px", "given_px", "expected_px"),
+    [
+        (100.0, (3.0, 2.0, 1.3), (3.0, 2.0, 1.3)),
+        (440.0, (3.0, 1.5), (6.0, 1.5)),
+        (440.0, (4.0, 2.0, 1.0), (6.0, np.sqrt(6.0), 1.0)),
+        (440.0, (2.0,), (2.0,)),
+    ],
+)
+def test_gates_begin_as_wide_as_poses_are_turned(focal_px, given_px, expected_px):
+    turn_deg = float(np.degrees(6.0 / 440.0))
+    config = RefineConfig(pose_gates_px=given_px, pose_turn_deg=turn_deg)
+    np.testing.assert_allclose(gates_px(config, focal_px), expected_px)
