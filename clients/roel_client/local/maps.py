@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from roel_service.scene.lines import LineMap
     from roel_service.wire.rlm import MapFile
 
-RLM_MAGIC = b"RLM1"
-
 
 def read_map_file(name: str) -> MapFile:
     """Decode a `.rlm` file."""
@@ -51,17 +49,10 @@ def export_map(name: str, path: Path) -> None:
 
 def import_map(name: str, path: Path) -> tuple[str, int, int]:
     """Write lines of another program as a map file; their format, and lines kept and left out."""
-    from roel_service.errors import MapFileError
-    from roel_service.io.foreign_maps import read_foreign_map
-    from roel_service.wire.provenance import Provenance
-    from roel_service.wire.rlm import decode_map, encode_map
+    from roel_service.jobs.imports import read_lines
 
-    foreign_format, line_map = read_foreign_map(Path(name), name)
-    if len(line_map) == 0:
-        raise MapFileError(name, "lines", "none")
-    rlm_bytes = encode_map(line_map, Provenance())
+    foreign_format, rlm_bytes, map_file = read_lines(Path(name), name)
     path.write_bytes(rlm_bytes)
-    map_file = decode_map(rlm_bytes, subject=name)
     return foreign_format, len(map_file.line_map), map_file.dropped_line_count
 
 
@@ -75,6 +66,7 @@ def read_map(name: str) -> LineMap:
 def is_map_file(name: str) -> bool:
     """Whether a file begins as a `.rlm` file does."""
     from roel_service.io.files import open_input
+    from roel_service.wire.rlm import RLM_MAGIC
 
     with open_input(Path(name)) as file:
         return file.read(len(RLM_MAGIC)) == RLM_MAGIC
