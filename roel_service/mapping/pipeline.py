@@ -21,9 +21,7 @@ from roel_service.mapping.front_end import (
 )
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_points import point_matcher
-from roel_service.mapping.match_sampled import (
-    LineMatcher,
-)
+from roel_service.mapping.match_sampled import LineMatcher
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.refine_poses import refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun

@@ -23,7 +23,7 @@ def usage_error(*arguments: str) -> UsageError:
         (("map", "build", "--events"), "--events: expected one argument, found none"),
         (
             ("map", "info", "m.rlm", "--frob"),
-            "roel: expected what --help shows, found --frob",
+            "--frob: expected an argument that --help shows, found --frob",
         ),
         (
             ("map", "info"),

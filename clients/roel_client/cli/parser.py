@@ -23,7 +23,7 @@ ARGPARSE_MESSAGES = (
     (r"argument \S+: invalid choice: (\S+) \(choose from (.*)\)", "{prog}", r"one of \2", r"\1"),
     (r"argument (\S+): (.*)", r"\1", "a use that --help shows", r"\2"),
     (r"the following arguments are required: (.*)", "{prog}", r"\1", "none"),
-    (r"unrecognized arguments: (.*)", "{prog}", "what --help shows", r"\1"),
+    (r"unrecognized arguments: (\S+)(.*)", r"\1", "an argument that --help shows", r"\1\2"),
     (r"(.*)", "{prog}", "a use that --help shows", r"\1"),
 )
 
