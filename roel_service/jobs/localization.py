@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from roel_service.arrays import Array
 from roel_service.io.images import decode_panorama, decode_photograph
-from roel_service.jobs.preparations import Form, Origin, Preparations
+from roel_service.jobs.preparations import Origin, Preparations
 from roel_service.jobs.questions import LocalizeQuestion, MapFile, StoredFile
 from roel_service.pano_loc.localize import localize_panorama, localize_photograph
 from roel_service.pano_loc.prepare import PreparedMap, prepare_map
@@ -16,8 +16,6 @@ from roel_service.v1 import localization_pb2
 from roel_service.wire.localization import localization_to_proto
 
 SUBJECT = "image"
-
-_PREPARED_MAP = Form(PreparedMap.to_arrays, PreparedMap.from_arrays)
 
 
 def answer(
@@ -67,5 +65,8 @@ def _prepared(file: MapFile, question: LocalizeQuestion, preparations: Preparati
     config = question.config
     origin = Origin(kind="localize_map", sha256=file.sha256, parameters=config)
     return preparations.of(
-        origin, lambda: prepare_map(file.line_map(), config), question.cache, _PREPARED_MAP
+        origin,
+        lambda: prepare_map(file.line_map(), config),
+        PreparedMap.from_arrays,
+        question.cache,
     )

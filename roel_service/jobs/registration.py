@@ -54,7 +54,10 @@ def _prepared(question: RegisterQuestion, preparations: Preparations) -> Prepare
     if isinstance(target, MapFile):
         origin = Origin(kind="register_map", sha256=target.sha256, parameters=config)
         return preparations.of(
-            origin, lambda: prepare_map(target.line_map(), config), question.cache
+            origin,
+            lambda: prepare_map(target.line_map(), config),
+            PreparedCloud.from_arrays,
+            question.cache,
         )
     if isinstance(target, StoredFile):
         sha256, cache = target.sha256, question.cache
@@ -62,7 +65,9 @@ def _prepared(question: RegisterQuestion, preparations: Preparations) -> Prepare
         # A cloud that came with its request hardly comes again after this child is gone.
         sha256, cache = hashlib.sha256(target).hexdigest(), None
     origin = Origin(kind="register_cloud", sha256=sha256, parameters=config)
-    return preparations.of(origin, lambda: prepare_cloud(_cloud(target), config), cache)
+    return preparations.of(
+        origin, lambda: prepare_cloud(_cloud(target), config), PreparedCloud.from_arrays, cache
+    )
 
 
 def _cloud(target: StoredFile | bytes) -> PointCloud:

@@ -91,6 +91,11 @@ class PreparedMap:
             channel=self.channel[chosen],
         )
 
+    @property
+    def size_bytes(self) -> int:
+        """Of memory."""
+        return sum(array.nbytes for array in self.to_arrays().values())
+
     def to_arrays(self) -> Arrays:
         """For keeping it."""
         plain = {name: value for name, value in vars(self).items() if name not in _PARTS}

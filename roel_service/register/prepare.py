@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RegisterConfig
 from roel_service.errors import CloudError
 from roel_service.geometry.segments import sample_segments
@@ -57,6 +58,34 @@ class PreparedCloud:
     axes: FloatArray
     voting: VotingGrid
 
+    @property
+    def size_bytes(self) -> int:
+        """Of memory, about: the trees take as much again as their points."""
+        return 2 * sum(array.nbytes for array in self.to_arrays().values()) + self.voting.size_bytes
+
+    def to_arrays(self) -> Mapping[str, Array]:
+        """For keeping it: what takes long to find. Trees and grid follow from that."""
+        return {
+            "points": self.points,
+            "resolution_m": np.array(self.resolution_m),
+            "surface_points": self.surface_points,
+            "surface_normals": self.surface_normals,
+            "crease_points": self.creases.points,
+            "crease_directions": self.creases.directions,
+        }
+
+    @staticmethod
+    def from_arrays(arrays: Mapping[str, Array]) -> PreparedCloud:
+        """The inverse."""
+        return _looked_up(
+            points=arrays["points"],
+            tree=cKDTree(arrays["points"]),
+            resolution_m=float(arrays["resolution_m"]),
+            surface_points=arrays["surface_points"],
+            surface_normals=arrays["surface_normals"],
+            creases=Creases(points=arrays["crease_points"], directions=arrays["crease_directions"]),
+        )
+
 
 def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
     """Thin a cloud, and find its local planes and creases.
@@ -78,24 +107,13 @@ def prepare_cloud(cloud: PointCloud, config: RegisterConfig) -> PreparedCloud:
         points, patches, patch_tree, cell_m, PLANE_TOLERANCE * resolution_m
     )
     creases = find_creases(patches, patch_tree, tree, cell_m)
-    axes = dominant_directions(creases.directions, np.ones(len(creases.points)))
-    return PreparedCloud(
+    return _looked_up(
         points=points,
         tree=tree,
         resolution_m=resolution_m,
         surface_points=points[is_flat],
         surface_normals=normals[is_flat],
-        surface_tree=cKDTree(points[is_flat]),
         creases=creases,
-        crease_tree=cKDTree(creases.points) if len(creases.points) else None,
-        axes=axes,
-        voting=voting_grid(
-            points,
-            creases,
-            axes,
-            ROOM_FOR_SOURCE * float(np.linalg.norm(np.ptp(points, axis=0))),
-            VOTING_CELLS * resolution_m,
-        ),
     )
 
 
@@ -109,24 +127,40 @@ def prepare_map(line_map: LineMap, config: RegisterConfig) -> PreparedCloud:
     """A line map as target: its lines are the creases, and there are no surfaces."""
     points, line = sample_segments(line_map.segments, config.voxel_m)
     directions = np.nan_to_num(unit(line_map.segments[:, 1] - line_map.segments[:, 0]))[line]
-    tree = cKDTree(points)
-    creases = Creases(points=points, directions=directions)
-    axes = dominant_directions(directions, np.ones(len(points)))
-    size_m = float(np.linalg.norm(np.ptp(points, axis=0)))
     nothing = np.empty((0, 3))
-    return PreparedCloud(
+    return _looked_up(
         points=points,
-        tree=tree,
+        tree=cKDTree(points),
         resolution_m=config.voxel_m,
         surface_points=nothing,
         surface_normals=nothing,
-        surface_tree=cKDTree(nothing),
+        creases=Creases(points=points, directions=directions),
+    )
+
+
+def _looked_up(
+    *,
+    points: FloatArray,
+    tree: cKDTree,
+    resolution_m: float,
+    surface_points: FloatArray,
+    surface_normals: FloatArray,
+    creases: Creases,
+) -> PreparedCloud:
+    """What was found in a target, with all that makes looking it up fast."""
+    axes = dominant_directions(creases.directions, np.ones(len(creases.points)))
+    room_m = ROOM_FOR_SOURCE * float(np.linalg.norm(np.ptp(points, axis=0)))
+    return PreparedCloud(
+        points=points,
+        tree=tree,
+        resolution_m=resolution_m,
+        surface_points=surface_points,
+        surface_normals=surface_normals,
+        surface_tree=cKDTree(surface_points),
         creases=creases,
-        crease_tree=tree,
+        crease_tree=cKDTree(creases.points) if len(creases.points) else None,
         axes=axes,
-        voting=voting_grid(
-            points, creases, axes, ROOM_FOR_SOURCE * size_m, VOTING_CELLS * config.voxel_m
-        ),
+        voting=voting_grid(points, creases, axes, room_m, VOTING_CELLS * resolution_m),
     )
 
 

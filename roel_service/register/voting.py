@@ -56,6 +56,11 @@ class VotingGrid:
     fine: Array
     fine_cell_m: float
 
+    @property
+    def size_bytes(self) -> int:
+        """Of memory."""
+        return sum(array.nbytes for array in (self.coarse, self.fine, *self.spectra))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Votes:

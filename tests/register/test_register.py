@@ -1,4 +1,5 @@
 import dataclasses
+import io
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from roel_service.geometry.se3 import SE3, rotation_angle, rotation_from_vector
 from roel_service.geometry.segments import sample_segments
 from roel_service.register.align import Level, align
 from roel_service.register.alignment import Alignment
-from roel_service.register.prepare import prepare_cloud
+from roel_service.register.prepare import PreparedCloud, prepare_cloud, prepare_map
 from roel_service.register.register import METHODS, register_map
 from roel_service.register.source import Samples, source_of_map
 from roel_service.register.verdict import overlap
@@ -41,6 +42,20 @@ def test_point_icp_comes_close_from_a_close_start(prepared):
     assert millimetres < 30.0
     assert result.converged
     assert result.verdict is Verdict.ACCEPTED
+
+
+@pytest.mark.parametrize("kind", ["cloud", "map"])
+def test_a_prepared_target_is_kept_as_plain_arrays(prepared, kind):
+    target = prepared if kind == "cloud" else prepare_map(room_map(), CONFIG)
+    file = io.BytesIO()
+    np.savez(file, **target.to_arrays())
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as arrays:
+        again = PreparedCloud.from_arrays(arrays)
+    assert again.size_bytes == target.size_bytes > 0
+    first, second = (register_map(room_map(), t, CONFIG, T_init=NUDGE) for t in (target, again))
+    np.testing.assert_array_equal(second.T_target_source.matrix(), first.T_target_source.matrix())
+    assert second.verdict is first.verdict
 
 
 @pytest.mark.parametrize("method", ["plane", "line"])
