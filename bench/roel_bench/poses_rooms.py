@@ -17,7 +17,7 @@ from roel_service.evaluation.poses import trajectory_errors
 from roel_service.geometry.alignment import align_poses
 from roel_service.geometry.se3 import SE3, vector_from_rotation
 from roel_service.mapping.pipeline import build_line_map
-from roel_service.mapping.refine_poses import refine_poses
+from roel_service.mapping.refine_poses import in_likeliest_world, refine_poses
 from roel_service.mapping.smooth_poses import smoothed
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseResult
@@ -73,7 +73,9 @@ def room_row(scene: Scene) -> RoomRow:
     result = refine_poses(scene.events, given, scene.camera, config)
     seconds = time.process_time() - began
     exact = refine_poses(scene.events, truth, scene.camera, config)
-    refined_map = _map(scene, result.trajectory, config)
+    # As `map build --refine-poses` has it.
+    placed = in_likeliest_world(result.trajectory, given, config.refine)
+    refined_map = _map(scene, placed, config)
     return RoomRow(
         room=scene.name,
         sensor=scene.sensor,
@@ -87,7 +89,7 @@ def room_row(scene: Scene) -> RoomRow:
         problems=tuple(problem.value for problem in result.report.problems),
         iou_true=_iou(_map(scene, truth, config), scene.truth),
         iou_refined=_iou(refined_map, scene.truth),
-        iou_aligned=_iou(_in_true_world(refined_map, result.trajectory, truth), scene.truth),
+        iou_aligned=_iou(_in_true_world(refined_map, placed, truth), scene.truth),
         seconds=seconds,
     )
 

@@ -48,20 +48,23 @@ def align_points(source: FloatArray, target: FloatArray, *, with_scale: bool) ->
     return Similarity(scale=scale, T_target_source=SE3(rotation=rotation, translation=translation))
 
 
-def align_poses(source: SE3, target: SE3) -> SE3:
-    """T_target_source that brings the positions of corresponding poses together.
+def align_poses(source: SE3, target: SE3, *, lever_m: float = 0.0) -> SE3:
+    """T_target_source that brings corresponding poses together, by least squares.
 
-    Where positions leave a turn open, since the camera went straight or stood still, the
-    orientations tell it.
+    By their positions; where these leave a turn open, since the camera went straight or stood
+    still, the orientations tell it. With a lever, orientations count throughout.
 
     Args:
         source, target: (N) poses, N >= 1.
+        lever_m: how far off a position counts as much as an orientation that is off by 1 rad.
     """
     source_mean, target_mean = source.translation.mean(axis=0), target.translation.mean(axis=0)
     source_offsets = source.translation - source_mean
     turns = (target.rotation @ np.swapaxes(source.rotation, -1, -2)).mean(axis=0)
     spread = float((source_offsets**2).sum())
     weight = ORIENTATION_SHARE * spread if spread > 0.0 else 1.0
+    # A squared turn is three less the trace of its matrix.
+    weight += 0.5 * len(source_offsets) * lever_m**2
     covariance = (target.translation - target_mean).T @ source_offsets + weight * turns
     U, _, Vt = np.linalg.svd(covariance)
     rotation = (U * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt

@@ -2,8 +2,9 @@
 
 Paper: "Multi-view Line Optimization" with free poses, and "Pose Refinement". The line term is the
 plane-to-line residual or, to compare with, LIMAP's reprojection; the event term is the angle
-between the events' rays and the plane that the frame's camera spans with the line. Nothing holds
-the scale but the start, and damping. Damped Gauss-Newton over all unknowns together.
+between the events' rays and the plane that the frame's camera spans with the line. Of a world that
+grows with its path no observation says anything: the scale is held at that of the given path, its
+root mean square distance from the first pose. Damped Gauss-Newton over all unknowns together.
 """
 
 from __future__ import annotations
@@ -161,6 +162,7 @@ class _Problem:
         events = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
         self.event_weight = config.event_weight * events[tracks.observation]
         self.root_forms = _roots(evidence.event_forms[tracks.observation][:, 3:, 3:])
+        self.extent_m2 = _extent_m2(detected.frames.T_world_camera)
 
     def first_state(self, lines: InfiniteLines, poses: SE3) -> _State:
         moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
@@ -286,12 +288,30 @@ class _Problem:
         size[size == 0.0] = 1.0
         damped = hessian / np.outer(size, size)
         damped[np.diag_indices_from(damped)] += damping
-        delta = -linalg.solve(damped, gradient / size, assume_a="pos") / size
+        grows, left_m2 = self._growth(state)
+        sides = np.stack([-gradient, grows], axis=-1) / size[:, None]
+        free, held = linalg.solve(damped, sides, assume_a="pos").T / size
+        # As far along what holds the path's extent as brings it back to the given one.
+        room = float(grows @ held)
+        delta = free + (left_m2 - grows @ free) / room * held if room > 0.0 else free
         by_line = delta[: 4 * self.line_count].reshape(-1, 4)
         by_pose = delta[4 * self.line_count :].reshape(-1, 6)
         U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, by_line)
         poses = state.poses.retract(np.concatenate([np.zeros((1, 6)), by_pose]))
         return _State(lines=OrthonormalLines(U=U, phi=phi), poses=poses)
+
+    def _growth(self, state: _State) -> tuple[FloatArray, float]:
+        """(U,) how the path's extent grows with the unknowns, and what it lacks of the given one."""
+        grows = np.zeros(4 * self.line_count + 6 * (len(self.frames) - 1))
+        position = state.poses.translation
+        by_pose = grows[4 * self.line_count :].reshape(-1, 6)
+        by_pose[:, 3:] = 2.0 * (position[1:] - position[0]) / len(position)
+        return grows, self.extent_m2 - _extent_m2(state.poses)
+
+
+def _extent_m2(poses: SE3) -> float:
+    """Mean square distance of the positions from the first one."""
+    return float(np.mean(np.sum((poses.translation - poses.translation[0]) ** 2, axis=-1)))
 
 
 def _cost(terms: Sequence[_Term]) -> float:

@@ -37,6 +37,7 @@ MAX_DIRECTION_COUNT = 8
 # this many cross.
 CANDIDATE_LINE_COUNT = 300
 PAIRED_LINE_COUNT = 60
+CANDIDATE_BLOCK_COUNT = 64
 MEAN_SHIFT_COUNT = 10
 # A line with this share of its density explained belongs to the direction and votes no more.
 EXPLAINED_SHARE = 0.2
@@ -127,8 +128,9 @@ def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
     if not votes.any():
         return np.empty((0, 3))
     candidates = _candidates(lines)
-    share = lines.density(candidates)
-    share /= share + BACKGROUND_DENSITY
+    # A block at a time: all candidates by all lines take long to write to memory and back.
+    blocks = np.array_split(candidates, 1 + len(candidates) // CANDIDATE_BLOCK_COUNT)
+    share = np.concatenate([_explained(lines, block) for block in blocks])
     while len(found) < MAX_DIRECTION_COUNT:
         strength = share @ votes
         # The mean shift can add lines to the best candidate, but hardly double them.
@@ -136,9 +138,9 @@ def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
             break
         direction = candidates[strength.argmax()]
         for _ in range(MEAN_SHIFT_COUNT):
-            explained = _explained(lines, direction)
+            explained = _explained(lines, direction[None])[0]
             direction = _shifted(lines, direction, votes * explained)
-        explained = _explained(lines, direction)
+        explained = _explained(lines, direction[None])[0]
         if votes @ explained < least:
             break
         found.append(direction)
@@ -146,9 +148,9 @@ def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
     return np.array(found).reshape(-1, 3)
 
 
-def _explained(lines: _UncertainDirections, direction: FloatArray) -> FloatArray:
-    """(L,) probability that each line has this direction, against the background."""
-    density = lines.density(direction[None])[0]
+def _explained(lines: _UncertainDirections, directions: FloatArray) -> FloatArray:
+    """(D, L) probability that each line has these (D, 3) directions, against the background."""
+    density = lines.density(directions)
     return np.asarray(density / (density + BACKGROUND_DENSITY))
 
 

@@ -18,10 +18,10 @@ from scipy import linalg, sparse
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import RefineConfig
-from roel_service.geometry import plucker
-from roel_service.geometry.se3 import rotation_vector_jacobian
-from roel_service.mapping import joint_kernels, refine_kernels
-from roel_service.mapping.frames import Frames
+from roel_service.geometry import plucker, projection
+from roel_service.geometry.se3 import SE3, rotation_vector_jacobian
+from roel_service.geometry.vectors import norm
+from roel_service.mapping import joint_kernels
 from roel_service.mapping.front_end import Detected
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import (
@@ -37,7 +37,6 @@ from roel_service.mapping.refine import (
     Refined,
     direction_system,
 )
-from roel_service.mapping.views import views_of
 from roel_service.scene.lines import InfiniteLines
 
 # Steps that are tried, each damped more, before the present state counts as the best one.
@@ -149,8 +148,7 @@ def refine_jointly(
         costs.append(system.observation_cost)
         for _ in range(MAX_TRIAL_COUNT):
             reduced = problem.reduced(system, damping)
-            trial = problem.step(state, system, reduced)
-            cost = problem.cost(trial, weight)
+            trial, cost = problem.step(state, system, reduced, weight)
             if cost <= system.cost:
                 break
             damping *= DAMPING_AFTER_FAILURE
@@ -174,6 +172,16 @@ def refine_jointly(
     )
 
 
+def _believed(prior: DirectionPrior, lines: InfiniteLines, config: RefineConfig) -> DirectionPrior:
+    """The directions of lines, the less held to the farther the lines are from them.
+
+    A line that fits a direction only as it hardly knows its own would move poses to turn.
+    """
+    sine = norm(np.cross(lines.direction, prior.direction))
+    scale = config.max_direction_distance * np.deg2rad(config.direction_sigma_deg)
+    return replace(prior, weight=prior.weight / (1.0 + (sine / scale) ** 2) ** 2)
+
+
 class _Problem:
     """The observations of all lines in one list, each row with its line and frame."""
 
@@ -190,14 +198,14 @@ class _Problem:
         frames, evidence = detected.frames, detected.evidence
         self.config = config
         self.free_lines = free_lines
-        self.observations = detected.observations
         self.frames = frames
+        self.end_rays = projection.ray_from_pixel(detected.observations.segments_px, frames.K)
         self.frame_of = evidence.views.frame
         self.offsets = refined.tracks.offsets
         self.observation = refined.tracks.observation
         self.line = refined.tracks.track_of_row
         self.origin = refined.origin
-        self.directions = directions
+        self.directions = directions and _believed(directions, refined.lines, config)
         self.precision = config.pose_noise_px**-2
         self.forms = frames.focal_px**2 * (
             evidence.segment_forms + config.event_weight * evidence.event_forms
@@ -223,23 +231,24 @@ class _Problem:
         moment = plucker.shift_origin(direction, moment, -self.origin)
         return InfiniteLines(direction=direction, moment=moment)
 
-    def moved_frames(self, state: _State) -> Frames:
-        """The frames with corrected poses."""
-        poses = state.correction.applied(self.frames.t_us, self.frames.T_world_camera)
-        return replace(self.frames, T_world_camera=poses)
+    def moved_poses(self, state: _State) -> SE3:
+        """(N) corrected poses of the frames."""
+        return state.correction.applied(self.frames.t_us, self.frames.T_world_camera)
 
     def weight(self, state: _State, *, loose: bool) -> FloatArray:
         """(S,) weights of iterated reweighting, 0 for outliers."""
         v, m = state.lines.plucker
-        views = views_of(self.observations, self.moved_frames(state))
-        residual_px = refine_kernels.end_residuals(
+        poses = self.moved_poses(state)
+        residual_px = joint_kernels.end_residuals(
             self.offsets,
             self.origin,
             v,
             m,
-            views.centre,
-            views.end_rays,
+            poses.rotation,
+            poses.translation,
+            self.frame_of,
             self.observation,
+            self.end_rays,
             self.frames.focal_px,
         )
         gate_px = self.config.max_residual_px * (FIRST_GATE if loose else 1.0)
@@ -248,38 +257,34 @@ class _Problem:
             np.where(residual_px < gate_px, robust, 0.0) * self.length_weight * self.precision
         )
 
-    def cost(self, state: _State, weight: FloatArray) -> float:
-        """Of lines, directions and drift, with fixed (S,) weights."""
-        v, m = state.lines.plucker
-        poses = self.moved_frames(state).T_world_camera
-        cost = refine_kernels.form_cost(
+    def line_costs(self, lines: OrthonormalLines, poses: SE3, weight: FloatArray) -> FloatArray:
+        """(L,) of observations and directions, with fixed (S,) weights."""
+        v, m = lines.plucker
+        cost = joint_kernels.joint_cost(
             self.offsets,
             self.origin,
             v,
             m,
             poses.rotation,
-            poses.translation[self.frame_of],
+            poses.translation,
             self.frame_of,
             self.observation,
             self.forms,
             weight,
-            False,
         )
-        return float(cost.sum()) + self._prior_cost(state)
-
-    def _prior_cost(self, state: _State) -> float:
-        """Of directions and drift."""
-        cost = float(np.sum(state.correction.control * state.drift.pull(state.correction)))
         if self.directions is not None:
-            held = direction_system(state.lines, self.directions)
-            cost += self.precision * float(held.cost.sum())
-        return cost
+            cost = cost + self.precision * direction_system(lines, self.directions).cost
+        return np.asarray(cost)
+
+    def drift_cost(self, state: _State) -> float:
+        """Of the correction itself."""
+        return float(np.sum(state.correction.control * state.drift.pull(state.correction)))
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Normal equations with fixed (S,) weights."""
         v, m = state.lines.plucker
         dv, dm = plucker.plucker_jacobians(state.lines.U, state.lines.phi)
-        poses = self.moved_frames(state).T_world_camera
+        poses = self.moved_poses(state)
         cost, by_line, by_lines, by_pose, by_poses, rows = joint_kernels.joint_system(
             self.offsets,
             self.origin,
@@ -293,8 +298,10 @@ class _Problem:
             self.forms,
             weight,
         )
+        observation_cost = float(cost.sum())
         if self.directions is not None:
             held = direction_system(state.lines, self.directions)
+            cost = cost + self.precision * held.cost
             by_line = by_line + self.precision * held.gradient
             by_lines = by_lines + self.precision * held.hessian
         by_tangent = self._pose_by_tangent(state)
@@ -307,8 +314,8 @@ class _Problem:
         blocks = sparse.bsr_array((by_poses, np.arange(frame_count), np.arange(frame_count + 1)))
         hessian = (control_by_frame.T @ blocks @ control_by_frame).toarray()
         return _System(
-            cost=float(cost.sum()) + self._prior_cost(state),
-            observation_cost=float(cost.sum()),
+            cost=float(cost.sum()) + self.drift_cost(state),
+            observation_cost=observation_cost,
             line_gradient=by_line,
             line_hessian=by_lines,
             control_gradient=control_by_frame.T @ by_pose.ravel()
@@ -364,13 +371,35 @@ class _Problem:
                 ),
             )
 
-    def step(self, state: _State, system: _System, reduced: _Reduced) -> _State:
-        """One step of everything."""
+    def step(
+        self, state: _State, system: _System, reduced: _Reduced, weight: FloatArray
+    ) -> tuple[_State, float]:
+        """One step of everything, and what it then costs with fixed (S,) weights.
+
+        Lines that are better off where they are stay: a line that hardly anything holds would
+        else stop all others.
+        """
         solved = linalg.solve(reduced.hessian, reduced.gradient, assume_a="pos")
         control = -solved.reshape(-1, 6)
-        correction = state.correction.stepped(control)
-        if not self.free_lines:
-            return replace(state, correction=correction)
+        moved = replace(state, correction=state.correction.stepped(control))
+        poses = self.moved_poses(moved)
+        costs = self.line_costs(state.lines, poses, weight)
+        if self.free_lines:
+            stepped = self._stepped_lines(state, system, reduced, control)
+            stepped_costs = self.line_costs(stepped, poses, weight)
+            better = stepped_costs < costs
+            lines = OrthonormalLines(
+                U=np.where(better[:, None, None], stepped.U, state.lines.U),
+                phi=np.where(better, stepped.phi, state.lines.phi),
+            )
+            moved = replace(moved, lines=lines)
+            costs = np.where(better, stepped_costs, costs)
+        return moved, float(costs.sum()) + self.drift_cost(moved)
+
+    def _stepped_lines(
+        self, state: _State, system: _System, reduced: _Reduced, control: FloatArray
+    ) -> OrthonormalLines:
+        """The lines that follow a (K, 6) step of the control points."""
         by_pose = (self.shares @ control)[self.frame_of[self.observation]]
         pulls = np.einsum("sij,sj->si", system.rows, by_pose)
         pull = np.stack([self._total(column) for column in pulls.T], axis=1)
@@ -378,7 +407,7 @@ class _Problem:
         turn = np.linalg.norm(delta[:, :3], axis=1)
         delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
         U, phi = plucker.retract_orthonormal(state.lines.U, state.lines.phi, delta)
-        return replace(state, lines=OrthonormalLines(U=U, phi=phi), correction=correction)
+        return OrthonormalLines(U=U, phi=phi)
 
     def with_drift(self, state: _State, reduced: _Reduced) -> _State:
         """With the drift that the correction tells of, as well as the last step's system knows."""

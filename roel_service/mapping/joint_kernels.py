@@ -23,6 +23,80 @@ def turned_cross(R: Array, a: Array, out: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def end_residuals(
+    offsets: Array,
+    origin: Array,
+    v: Array,
+    m: Array,
+    rotation: Array,
+    position: Array,
+    frame: Array,
+    observation: Array,
+    end_rays: Array,
+    focal_px: float,
+) -> Array:
+    """(S,) the larger distance of the observed ends from the line's image, as angle times f.
+
+    Args:
+        end_rays: (M, 2, 3) unit rays of all observations' ends, camera frame.
+        focal_px: focal length.
+
+    The others are as in `joint_system`.
+    """
+    residual = np.empty(len(observation))
+    y = np.empty(6)
+    for line in range(len(v)):
+        for row in range(offsets[line], offsets[line + 1]):
+            k = observation[row]
+            f = frame[k]
+            cx = position[f, 0] - origin[line, 0]
+            cy = position[f, 1] - origin[line, 1]
+            cz = position[f, 2] - origin[line, 2]
+            into_camera(rotation[f], cx, cy, cz, v[line], m[line], y)
+            norm = np.sqrt(y[3] * y[3] + y[4] * y[4] + y[5] * y[5])
+            ray = end_rays[k]
+            first = abs(ray[0, 0] * y[3] + ray[0, 1] * y[4] + ray[0, 2] * y[5])
+            second = abs(ray[1, 0] * y[3] + ray[1, 1] * y[4] + ray[1, 2] * y[5])
+            residual[row] = focal_px * max(first, second) / norm
+    return residual
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def joint_cost(
+    offsets: Array,
+    origin: Array,
+    v: Array,
+    m: Array,
+    rotation: Array,
+    position: Array,
+    frame: Array,
+    observation: Array,
+    forms: Array,
+    weight: Array,
+) -> Array:
+    """(L,) the cost alone; arguments as in `joint_system`."""
+    cost = np.zeros(len(v))
+    y = np.empty(6)
+    for line in range(len(v)):
+        for row in range(offsets[line], offsets[line + 1]):
+            if weight[row] == 0.0:
+                continue
+            k = observation[row]
+            f = frame[k]
+            cx = position[f, 0] - origin[line, 0]
+            cy = position[f, 1] - origin[line, 1]
+            cz = position[f, 2] - origin[line, 2]
+            into_camera(rotation[f], cx, cy, cz, v[line], m[line], y)
+            squared = y[3] * y[3] + y[4] * y[4] + y[5] * y[5]
+            value = 0.0
+            for i in range(6):
+                for j in range(6):
+                    value += y[i] * forms[k, i, j] * y[j]
+            cost[line] += weight[row] * value / squared
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def joint_system(
     offsets: Array,
     origin: Array,

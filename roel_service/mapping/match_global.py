@@ -14,7 +14,7 @@ from scipy import sparse
 
 from roel_service.arrays import FloatArray, IntArray
 from roel_service.config.stages import Config, MatchGlobalConfig, RefineRoundsConfig
-from roel_service.geometry import plucker, projection, segments
+from roel_service.geometry import plucker
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
@@ -32,8 +32,9 @@ from roel_service.scene.trajectory import Trajectory
 # A line is looked for this much beyond what is covered of it, at each end.
 LENGTHENING = 0.1
 # Lines are projected where they are at least this far in front of the camera, as a share of their
-# own distance.
+# own distance, and at least as far as divides.
 NEAR_SHARE = 1e-3
+LEAST_DEPTH_M = 1e-9
 # Shorter projections are not looked at.
 MIN_PROJECTION_PX = 5.0
 # How much many observations count against a small residual when lines compete for one: px for a
@@ -150,8 +151,9 @@ def _associate(
     )
     line = np.concatenate([refined.tracks.track_of_row, line])
     member = np.concatenate([refined.tracks.observation, member])
-    pairs = np.unique(np.stack([line, member]), axis=1)
-    return LineTracks.from_rows(pairs[0], pairs[1], len(refined))
+    # One number a pair: they are sorted ten times faster than columns.
+    pairs = np.unique(line.astype(np.int64) * len(observations) + member)
+    return LineTracks.from_rows(*np.divmod(pairs, max(1, len(observations))), len(refined))
 
 
 def _along(
@@ -202,15 +204,18 @@ def _lengthened(refined: Refined, views: Views) -> FloatArray:
 
 def project_segments(segments_world: FloatArray, T_camera_world: SE3, frames: Frames) -> FloatArray:
     """(L, 2, 2) px of 3D segments in one camera; NaN where nothing of them is in its image."""
-    in_camera = T_camera_world @ segments_world
-    distance_m = np.abs(in_camera[..., 2]).max(axis=-1)
-    clipped = projection.clip_to_depth(in_camera, np.fmax(NEAR_SHARE * distance_m, 1e-9)[:, None])
-    projected = projection.project(clipped, frames.K)
-    size_px = np.array([frames.width, frames.height])
-    low, high = projected.min(axis=1), projected.max(axis=1)
-    seen = ((high >= 0) & (low < size_px)).all(axis=-1)
-    long_enough = segments.length(projected) >= MIN_PROJECTION_PX
-    return np.where((seen & long_enough)[:, None, None], projected, np.nan)
+    return np.asarray(
+        match_global_kernels.projected_segments(
+            segments_world,
+            T_camera_world.rotation,
+            T_camera_world.translation,
+            frames.K,
+            (frames.width, frames.height),
+            NEAR_SHARE,
+            LEAST_DEPTH_M,
+            MIN_PROJECTION_PX,
+        )
+    )
 
 
 def _image_lines(

@@ -1,4 +1,4 @@
-"""Pairwise loop over projected lines and the observations of one frame."""
+"""Loops over the lines and the observations of one frame."""
 
 from __future__ import annotations
 
@@ -6,6 +6,60 @@ import numba
 import numpy as np
 
 from roel_service.arrays import Array
+
+
+@numba.njit(cache=True, nogil=True)
+def projected_segments(
+    spans: Array,
+    rotation: Array,
+    translation: Array,
+    K: Array,
+    size_px: tuple[int, int],
+    near_share: float,
+    least_depth_m: float,
+    min_length_px: float,
+) -> Array:
+    """(L, 2, 2) px of 3D segments in one camera; NaN where nothing of them is in its image.
+
+    Args:
+        spans: (L, 2, 3) endpoints, m, world.
+        rotation, translation: (3, 3) and (3,) camera from world.
+        K: (3, 3) calibration matrix without skew, px.
+        size_px: width and height.
+        near_share: segments are cut this far in front of the camera, as a share of their farther
+            end's depth, ...
+        least_depth_m: ... and at least so far.
+        min_length_px: shorter projections are left out.
+    """
+    found = np.full((len(spans), 2, 2), np.nan)
+    ends, pixels = np.empty((2, 3)), np.empty((2, 2))
+    for line in range(len(spans)):
+        for end in range(2):
+            x, y, z = spans[line, end]
+            for i in range(3):
+                turned = rotation[i, 0] * x + rotation[i, 1] * y + rotation[i, 2] * z
+                ends[end, i] = turned + translation[i]
+        near = max(near_share * max(abs(ends[0, 2]), abs(ends[1, 2])), least_depth_m)
+        # Said so that what is not a number is not in view.
+        if not (ends[0, 2] >= near or ends[1, 2] >= near):
+            continue
+        for end in range(2):
+            if ends[end, 2] < near:
+                share = (near - ends[end, 2]) / (ends[1 - end, 2] - ends[end, 2])
+                for i in range(3):
+                    ends[end, i] += share * (ends[1 - end, i] - ends[end, i])
+        for end in range(2):
+            for i in range(2):
+                pixels[end, i] = ends[end, i] / ends[end, 2] * K[i, i] + K[i, 2]
+        is_seen = (
+            np.hypot(pixels[1, 0] - pixels[0, 0], pixels[1, 1] - pixels[0, 1]) >= min_length_px
+        )
+        for i in range(2):
+            low, high = min(pixels[0, i], pixels[1, i]), max(pixels[0, i], pixels[1, i])
+            is_seen = is_seen and high >= 0.0 and low < size_px[i]
+        if is_seen:
+            found[line] = pixels
+    return found
 
 
 @numba.njit(cache=True, nogil=True)

@@ -23,7 +23,7 @@ from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_points import point_matcher
 from roel_service.mapping.match_sampled import LineMatcher
 from roel_service.mapping.refine import Refined, refine_lines
-from roel_service.mapping.refine_poses import refine_poses
+from roel_service.mapping.refine_poses import in_likeliest_world, refine_poses
 from roel_service.mapping.run import CountedEvents, MappingRun
 from roel_service.mapping.stage_cache import NoCache, StageCache
 from roel_service.mapping.trim import trim_to_segments
@@ -82,7 +82,7 @@ def build_line_map(
     if config.refine.free_poses:
         before = part_of(progress, 0.0, POSES_SHARE)
         poses = refine_poses(events, trajectory, camera, config, progress=before)
-        trajectory = poses.trajectory
+        trajectory = in_likeliest_world(poses.trajectory, trajectory, config.refine)
         # What was found before, was found from other poses.
         cache, known = NO_CACHE, NO_KNOWN_FRAMES
         run = MappingRun(part_of(progress, POSES_SHARE, 1.0), seconds=poses.report.seconds)

@@ -21,6 +21,7 @@ as n times their mean e, squared.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from roel_service.geometry.vectors import dot, norm
 from roel_service.mapping import refine_kernels
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.views import cuts_m
+from roel_service.mapping.views import Views, cuts_m
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
 # Damping relative to the diagonal: start, and factors after a good and a bad step.
@@ -177,27 +178,36 @@ class _Problem:
         self.focal_px = frames.focal_px
         self.offsets = tracks.offsets
         self.line = tracks.track_of_row
-        views = evidence.views.take(tracks.observation)
-        self.origin = self.mean(views.centre)
-        self.corners = corners and replace(corners, point=corners.point - self.origin)
-        # As seen about the origin of each row's line.
-        self.views = replace(views, centre=views.centre - self.origin[self.line])
         self.observation = tracks.observation
         self.evidence = evidence
         self.rotation = frames.T_world_camera.rotation
-        length = np.minimum(self.views.length_px, config.max_length_weight_px)
+        centre = evidence.views.centre[self.observation]
+        self.origin = self.mean(centre)
+        self.corners = corners and replace(corners, point=corners.point - self.origin)
+        # (S, 3) about the origin of each row's line.
+        self.centre = centre - self.origin[self.line]
+        length_px = evidence.views.length_px[self.observation]
+        length = np.minimum(length_px, config.max_length_weight_px)
         if config.residual == "grassmann":
             # As published: the length in pixels, and lambda for each event.
             self.weight = length
-            self.forms = evidence.event_forms
+            forms = evidence.event_forms
             self.form_weight = config.event_weight * evidence.event_counts[tracks.observation]
         else:
             forms = config.event_weight * evidence.event_forms
             if config.residual == "pixel":
                 forms = evidence.segment_forms + forms
+            forms = self.focal_px**2 * forms
             self.weight = length / config.max_length_weight_px
-            self.forms = self.focal_px**2 * forms
             self.form_weight = self.weight
+        self.forms = refine_kernels.world_forms(
+            self.centre, self.rotation, evidence.views.frame, self.observation, forms
+        )
+
+    @cached_property
+    def views(self) -> Views:
+        """(S) as seen about the origin of each row's line."""
+        return replace(self.evidence.views.take(self.observation), centre=self.centre)
 
     def total(self, rows: FloatArray) -> FloatArray:
         """(L, ...) sums of (S, ...) rows over each line."""
@@ -266,38 +276,21 @@ class _Problem:
     def _form_cost(self, state: OrthonormalLines, weight: FloatArray) -> FloatArray:
         """(L,) sum w e with e = y^T G y / |m_c|^2, or w e^2."""
         v, m = state.plucker
-        views = self.evidence.views
-        return np.asarray(
-            refine_kernels.form_cost(
-                self.offsets,
-                self.origin,
-                v,
-                m,
-                self.rotation,
-                views.centre,
-                views.frame,
-                self.observation,
-                self.forms,
-                weight,
-                self.quartic,
-            )
+        cost = refine_kernels.form_cost(
+            self.offsets, v, m, self.centre, self.forms, weight, self.quartic
         )
+        return np.asarray(cost)
 
     def _form_system(self, state: OrthonormalLines, weight: FloatArray) -> NormalEquations:
         """Of sum w e with e = y^T G y / |m_c|^2, y the line in each camera's frame, or w e^2."""
         v, m = state.plucker
         dv, dm = plucker.plucker_jacobians(state.U, state.phi)
-        views = self.evidence.views
         cost, gradient, hessian = refine_kernels.form_system(
             self.offsets,
-            self.origin,
             v,
             m,
             np.concatenate([dv, dm], axis=-2),
-            self.rotation,
-            views.centre,
-            views.frame,
-            self.observation,
+            self.centre,
             self.forms,
             weight,
             self.quartic,

@@ -4,6 +4,8 @@ Symbols: a line has Pluecker coordinates y = (v, m) about its own origin. A came
 (world from camera) and centre c, about the same origin, sees it as v_c = R^T v and
 m_c = R^T (m - c x v). An observation with form G (6, 6), in its camera frame, costs
 y_c^T G y_c / |m_c|^2; for a line through the camera's centre that is not a number, as in NumPy.
+Cameras that stay where they are leave a form of y itself, y^T F y = y_c^T G y_c, and forms of one
+line add up before they meet its Jacobian.
 """
 
 from __future__ import annotations
@@ -64,36 +66,77 @@ def end_residuals(
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def turned(R: Array, A: Array, half: Array, out: Array) -> None:
+    """Write R A R^T to `out` (3, 3), by way of `half` (3, 3)."""
+    for i in range(3):
+        for j in range(3):
+            half[i, j] = R[i, 0] * A[0, j] + R[i, 1] * A[1, j] + R[i, 2] * A[2, j]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = half[i, 0] * R[j, 0] + half[i, 1] * R[j, 1] + half[i, 2] * R[j, 2]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def add_crossed(c: Array, A: Array, out: Array) -> None:
+    """Add [c]x A to `out` (3, 3)."""
+    for j in range(3):
+        out[0, j] += c[1] * A[2, j] - c[2] * A[1, j]
+        out[1, j] += c[2] * A[0, j] - c[0] * A[2, j]
+        out[2, j] += c[0] * A[1, j] - c[1] * A[0, j]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def world_forms(
+    centre: Array, rotation: Array, frame: Array, observation: Array, forms: Array
+) -> Array:
+    """(S, 6, 6) forms of lines about their own origins, in the world.
+
+    Args:
+        centre: (S, 3) camera centre of each row, m, world, about the origin of its line.
+        rotation: (N, 3, 3) world from camera, of the frames.
+        frame: (M,) of all observations.
+        observation: (S,) of each row.
+        forms: (M, 6, 6) of all observations, camera frame.
+    """
+    found = np.empty((len(observation), 6, 6))
+    half = np.empty((3, 3))
+    for row in range(len(observation)):
+        R, form = rotation[frame[observation[row]]], forms[observation[row]]
+        c, vv, vm, mm = centre[row], found[row, :3, :3], found[row, :3, 3:], found[row, 3:, 3:]
+        turned(R, form[:3, :3], half, vv)
+        turned(R, form[:3, 3:], half, vm)
+        turned(R, form[3:, 3:], half, mm)
+        # With y_c = (v, m - [c]x v): F_vm = G_vm + [c]x G_mm, F_vv = G_vv + [c]x G_mv - F_vm [c]x.
+        add_crossed(c, vm.T, vv)
+        add_crossed(c, mm, vm)
+        add_crossed(c, vm.T, vv.T)
+        found[row, 3:, :3] = vm.T
+    return found
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def form_cost(
-    offsets: Array,
-    origin: Array,
-    v: Array,
-    m: Array,
-    rotation: Array,
-    centre: Array,
-    frame: Array,
-    observation: Array,
-    forms: Array,
-    weight: Array,
-    quartic: bool,
+    offsets: Array, v: Array, m: Array, centre: Array, forms: Array, weight: Array, quartic: bool
 ) -> Array:
     """(L,) the cost alone; arguments as in `form_system`."""
     cost = np.zeros(len(v))
-    y = np.empty(6)
     for line in range(len(v)):
         for row in range(offsets[line], offsets[line + 1]):
             if weight[row] == 0.0:
                 continue
-            k = observation[row]
-            cx = centre[k, 0] - origin[line, 0]
-            cy = centre[k, 1] - origin[line, 1]
-            cz = centre[k, 2] - origin[line, 2]
-            into_camera(rotation[frame[k]], cx, cy, cz, v[line], m[line], y)
-            squared = y[3] * y[3] + y[4] * y[4] + y[5] * y[5]
-            value = 0.0
-            for i in range(6):
-                for j in range(6):
-                    value += y[i] * forms[k, i, j] * y[j]
+            value, squared = 0.0, 0.0
+            for i in range(3):
+                j, k = (i + 1) % 3, (i + 2) % 3
+                seen = m[line, i] - centre[row, j] * v[line, k] + centre[row, k] * v[line, j]
+                squared += seen * seen
+            for i in range(3):
+                pull, turn = 0.0, 0.0
+                for j in range(3):
+                    pull += forms[row, i, j] * v[line, j] + forms[row, i, j + 3] * m[line, j]
+                    turn += (
+                        forms[row, j, i + 3] * v[line, j] + forms[row, i + 3, j + 3] * m[line, j]
+                    )
+                value += v[line, i] * pull + m[line, i] * turn
             quotient = value / squared
             cost[line] += weight[row] * (quotient * quotient if quartic else quotient)
     return cost
@@ -102,14 +145,10 @@ def form_cost(
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def form_system(
     offsets: Array,
-    origin: Array,
     v: Array,
     m: Array,
     jacobian: Array,
-    rotation: Array,
     centre: Array,
-    frame: Array,
-    observation: Array,
     forms: Array,
     weight: Array,
     quartic: bool,
@@ -118,14 +157,10 @@ def form_system(
 
     Args:
         offsets: (L + 1,) rows of each line.
-        origin: (L, 3) m, world, about which `m` is taken.
-        v, m: (L, 3).
+        v, m: (L, 3), about the line's origin.
         jacobian: (L, 6, 4) of (v, m) by the line's parameters.
-        rotation: (N, 3, 3) world from camera, of the frames.
-        centre: (M, 3) camera centres of all observations, m, world.
-        frame: (M,) of all observations.
-        observation: (S,) of each row.
-        forms: (M, 6, 6) of all observations, camera frame.
+        centre: (S, 3) camera centre of each row, m, world, about the origin of its line.
+        forms: (S, 6, 6) `world_forms`.
         weight: (S,) of each row; rows of weight zero are passed over.
         quartic: the cost of a row is its weight times the square of what it is otherwise.
 
@@ -136,54 +171,56 @@ def form_system(
     cost = np.zeros(line_count)
     gradient = np.zeros((line_count, 4))
     hessian = np.zeros((line_count, 4, 4))
-    y = np.empty(6)
-    column = np.empty(6)
-    J = np.empty((6, 4))
-    GJ = np.empty((6, 4))
-    slope = np.empty(4)
+    y, seen, slope = np.empty(6), np.empty(3), np.empty(6)
+    by_y, by_ys = np.empty(6), np.empty((6, 6))
     for line in range(line_count):
+        y[:3], y[3:] = v[line], m[line]
+        by_y[:], by_ys[:] = 0.0, 0.0
         for row in range(offsets[line], offsets[line + 1]):
             if weight[row] == 0.0:
                 continue
-            k = observation[row]
-            cx = centre[k, 0] - origin[line, 0]
-            cy = centre[k, 1] - origin[line, 1]
-            cz = centre[k, 2] - origin[line, 2]
-            R = rotation[frame[k]]
-            into_camera(R, cx, cy, cz, v[line], m[line], y)
-            for p in range(4):
-                into_camera(R, cx, cy, cz, jacobian[line, :3, p], jacobian[line, 3:, p], column)
-                J[:, p] = column
-            for i in range(6):
-                for p in range(4):
-                    value = 0.0
-                    for j in range(6):
-                        value += forms[k, i, j] * J[j, p]
-                    GJ[i, p] = value
-            squared = y[3] * y[3] + y[4] * y[4] + y[5] * y[5]
+            c = centre[row]
+            seen[0] = y[3] - (c[1] * y[2] - c[2] * y[1])
+            seen[1] = y[4] - (c[2] * y[0] - c[0] * y[2])
+            seen[2] = y[5] - (c[0] * y[1] - c[1] * y[0])
+            squared = seen[0] * seen[0] + seen[1] * seen[1] + seen[2] * seen[2]
             value = 0.0
             for i in range(6):
+                slope[i] = 0.0
                 for j in range(6):
-                    value += y[i] * forms[k, i, j] * y[j]
+                    slope[i] += forms[row, i, j] * y[j]
+                value += y[i] * slope[i]
             quotient = value / squared
             cost[line] += weight[row] * (quotient * quotient if quartic else quotient)
             scale = weight[row] * (2.0 * quotient if quartic else 1.0) / squared
             bend = 4.0 * weight[row] / (squared * squared) if quartic else 0.0
-            for p in range(4):
-                value = 0.0
-                for i in range(6):
-                    value += y[i] * GJ[i, p]
-                # The quotient's own derivative: its denominator grows too.
-                pull = y[3] * J[3, p] + y[4] * J[4, p] + y[5] * J[5, p]
-                slope[p] = value - quotient * pull
-                gradient[line, p] += scale * slope[p]
-            for p in range(4):
-                for q in range(p, 4):
-                    value = 0.0
-                    for i in range(6):
-                        value += J[i, p] * GJ[i, q]
-                    hessian[line, p, q] += scale * value + bend * slope[p] * slope[q]
-        for p in range(4):
-            for q in range(p):
-                hessian[line, p, q] = hessian[line, q, p]
+            # The quotient's own derivative: its denominator grows too.
+            slope[0] -= quotient * (c[1] * seen[2] - c[2] * seen[1])
+            slope[1] -= quotient * (c[2] * seen[0] - c[0] * seen[2])
+            slope[2] -= quotient * (c[0] * seen[1] - c[1] * seen[0])
+            for i in range(3):
+                slope[i + 3] -= quotient * seen[i]
+            for i in range(6):
+                by_y[i] += scale * slope[i]
+                for j in range(i, 6):
+                    by_ys[i, j] += scale * forms[row, i, j]
+                    if quartic:
+                        by_ys[i, j] += bend * slope[i] * slope[j]
+        by_parameters(jacobian[line], by_y, by_ys, gradient[line], hessian[line])
     return cost, gradient, hessian
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def by_parameters(J: Array, by_y: Array, by_ys: Array, gradient: Array, hessian: Array) -> None:
+    """Write J^T g (4,) and J^T H J (4, 4); of H the upper triangle is read."""
+    for p in range(4):
+        for i in range(6):
+            gradient[p] += J[i, p] * by_y[i]
+            pulled = 0.0
+            for j in range(6):
+                pulled += (by_ys[i, j] if j >= i else by_ys[j, i]) * J[j, p]
+            for q in range(p + 1):
+                hessian[q, p] += J[i, q] * pulled
+    for p in range(4):
+        for q in range(p):
+            hessian[p, q] = hessian[q, p]

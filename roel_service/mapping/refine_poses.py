@@ -156,6 +156,19 @@ def refine_poses(
     return PoseResult(trajectory=refined, covariance=covariance, report=report)
 
 
+def in_likeliest_world(refined: Trajectory, given: Trajectory, config: RefineConfig) -> Trajectory:
+    """Refined poses where the given ones, by all they say, put the world.
+
+    A path of a metre says little about how the world is turned, orientations say it directly:
+    both count, each against the drift that is expected of it. Positions alone leave lines some
+    metres away off by more.
+    """
+    drift = Drift.configured(config)
+    poses, asked = refined.T_world_camera, given.T_world_camera
+    T_world_refined = align_poses(poses, asked, lever_m=drift.sigma_m / drift.sigma_rad)
+    return Trajectory(t_us=refined.t_us, T_world_camera=T_world_refined @ poses)
+
+
 def _found(
     events: EventSource,
     given: Trajectory,

@@ -35,3 +35,15 @@ def test_positions_count_before_orientations():
     )
     # The orientations' share is a millionth.
     np.testing.assert_allclose(align_poses(source, turned).matrix(), np.eye(4), atol=1e-5)
+
+
+def test_positions_and_orientations_meet_where_their_squares_are_least():
+    source = poses(np.random.default_rng(0).normal(size=(50, 3)))
+    spin = SE3(rotation=rotation_from_vector(np.array([0.0, 0.0, 0.01])), translation=np.zeros(3))
+    turned = SE3(rotation=spin.rotation @ source.rotation, translation=source.translation)
+    offsets = source.translation - source.translation.mean(axis=0)
+    reach2_m2 = np.mean(offsets[:, 0] ** 2 + offsets[:, 1] ** 2)
+    # Orientations ask for the whole turn, positions for none, about an axis through their middle.
+    rotation = align_poses(source, turned, lever_m=2.0).rotation
+    expected_rad = 0.01 * 2.0**2 / (2.0**2 + reach2_m2)
+    np.testing.assert_allclose(rotation[1, 0], expected_rad, rtol=0.02)

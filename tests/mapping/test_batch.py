@@ -54,7 +54,7 @@ def lines_of(world, config):
 
 
 def ate_m(poses, truth):
-    """After the best similarity: nothing but the start holds the scale."""
+    """After the best similarity: noise of the given path is in its scale."""
     fit = align_points(poses.translation, truth.translation, with_scale=True)
     off = fit.apply(poses.translation) - truth.translation
     return float(np.sqrt(np.mean(np.sum(off**2, axis=-1))))
@@ -79,6 +79,19 @@ def test_the_first_pose_is_held():
     found = refine_batch(lines_of(exact, PAPER), detected, PAPER)
     first = detected.frames.T_world_camera[0]
     np.testing.assert_allclose(found.T_world_camera[0].matrix(), first.matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_the_path_stays_as_large_as_it_is_given(name):
+    exact, config = world(), CONFIGS[name]
+    detected = seen(exact, config, wrong_poses(exact))
+    found = refine_batch(lines_of(exact, config), detected, config)
+
+    def extent_m(poses):
+        return np.sqrt(np.mean(np.sum((poses.translation - poses.translation[0]) ** 2, axis=-1)))
+
+    given_m = extent_m(detected.frames.T_world_camera)
+    assert extent_m(found.T_world_camera) == pytest.approx(given_m, rel=1e-4)
 
 
 @pytest.mark.parametrize("name", CONFIGS)

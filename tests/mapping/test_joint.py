@@ -9,9 +9,9 @@ from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_points
 from roel_service.geometry.se3 import SE3
 from roel_service.mapping.front_end import Detected
-from roel_service.mapping.joint import _Problem, _State, refine_jointly
+from roel_service.mapping.joint import _believed, _Problem, _State, refine_jointly
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
-from roel_service.mapping.refine import OrthonormalLines, refine_lines
+from roel_service.mapping.refine import DirectionPrior, OrthonormalLines, refine_lines
 
 from .synthetic import line_errors, observed, perturbed, trajectory, world
 
@@ -161,7 +161,12 @@ class TestGradient:
         )
         weight = rng.uniform(0.1, 1.0, len(problem.line))
         system = problem.system(state, weight)
-        assert problem.cost(state, weight) == pytest.approx(system.cost, rel=1e-12)
+
+        def cost_of(state):
+            lines = problem.line_costs(state.lines, problem.moved_poses(state), weight)
+            return lines.sum() + problem.drift_cost(state)
+
+        assert cost_of(state) == pytest.approx(system.cost, rel=1e-12)
 
         def cost(line_step, control_step):
             moved = plucker.retract_orthonormal(U, phi, line_step)
@@ -169,7 +174,7 @@ class TestGradient:
             stepped = _State(
                 lines=lines, correction=wrong.stepped(control_step), drift=drift, drift_told=drift
             )
-            return problem.cost(stepped, weight)
+            return cost_of(stepped)
 
         no_line, no_control = np.zeros((len(phi), 4)), np.zeros((len(wrong), 6))
         gradient = 2.0 * system.control_gradient.reshape(-1, 6)
@@ -194,7 +199,8 @@ class TestGradient:
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
         problem = _Problem(start, none, detected, CONFIG, None, free_lines=True)
         state = problem.first_state(start.lines, none, DRIFT)
-        system = problem.system(state, problem.weight(state, loose=True))
+        weight = problem.weight(state, loose=True)
+        system = problem.system(state, weight)
         line_count, size = len(start), 6 * len(none)
         whole = np.zeros((4 * line_count + size, 4 * line_count + size))
         for line in range(line_count):
@@ -206,7 +212,20 @@ class TestGradient:
         whole[4 * line_count :, 4 * line_count :] = system.control_hessian
         gradient = np.concatenate([system.line_gradient.ravel(), system.control_gradient])
         step = -np.linalg.solve(whole, gradient)[4 * line_count :]
-        moved = problem.step(state, system, problem.reduced(system, 0.0))
+        moved, _ = problem.step(state, system, problem.reduced(system, 0.0), weight)
         np.testing.assert_allclose(
             moved.correction.control.ravel(), step, atol=1e-5 * np.abs(step).max()
         )
+
+
+def test_a_line_far_from_its_direction_is_hardly_held_to_it():
+    exact = world()
+    detected = seen(exact)
+    start = lines_of(exact, detected)
+    turned = np.roll(start.lines.direction, 1, axis=0)
+    prior = DirectionPrior(direction=turned, weight=np.full(len(start), 1e3))
+    held = _believed(prior, start.lines, CONFIG)
+    sine = np.linalg.norm(np.cross(start.lines.direction, turned), axis=-1)
+    assert (held.weight[sine > 0.5] < 1e-4 * 1e3).all()
+    own = dataclasses.replace(prior, direction=start.lines.direction)
+    np.testing.assert_allclose(_believed(own, start.lines, CONFIG).weight, 1e3)
