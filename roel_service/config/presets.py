@@ -44,6 +44,7 @@ PAPER = Config(
     refine=RefineConfig(
         residual="grassmann",
         loss="squared",
+        loss_scale_px=0.7,
         event_weight=1e4,
         event_count_per_line=50,
         max_length_weight_px=UNLIMITED,
@@ -53,7 +54,7 @@ PAPER = Config(
         min_inlier_count=10,
     ),
     # What triangulation takes from here; the rest of its cost is its own.
-    refine_rounds=RefineRoundsConfig(max_residual_px=20.0, min_inlier_count=10),
+    refine_rounds=RefineRoundsConfig(loss_scale_px=0.7, max_residual_px=20.0, min_inlier_count=10),
     trim=TrimConfig(
         method="cluster",
         max_sigma_m=UNLIMITED,

@@ -232,6 +232,8 @@ class MatchGlobalConfig(Stage, table="match_global"):
         min_overlap: share of an observation that must face the projected line.
         max_speed_difference_px_per_ms: observed against predicted normal speed.
         max_shared_fraction: of two lines that share more observations, the weaker one goes.
+        one_side: a line keeps to observations that see its bright side where most of them do
+            (`reassociate`).
     """
 
     method: str = parameter("reassociate", one_of(MATCH_GLOBAL_METHODS))
@@ -246,6 +248,7 @@ class MatchGlobalConfig(Stage, table="match_global"):
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
     max_shared_fraction: float = parameter(0.9, SHARE)
+    one_side: bool = True
 
     @property
     def matches_points(self) -> bool:
@@ -322,7 +325,7 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
 
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
     loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
-    loss_scale_px: float = parameter(0.7, POSITIVE)
+    loss_scale_px: float = parameter(0.35, POSITIVE)
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
     direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
@@ -375,6 +378,7 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         pose_drift_s: the time after which they have forgotten it.
     """
 
+    loss_scale_px: float = parameter(0.25, POSITIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     corner_sigma_m: float = parameter(0.02, NOT_NEGATIVE)
     corner_distance_px: float = parameter(5.0, POSITIVE)
@@ -402,6 +406,8 @@ class TrimConfig(Stage, table="trim"):
         min_pixel_gap_px: gaps below this many pixels at the viewing distance are bridged too.
         min_coverage_count, min_coverage_fraction: frames that must have seen a bin, absolute and
             against the best bin.
+        max_foreshortening: views in which a line looks this many times shorter than it is, nearly
+            end on, do not count (`coverage`).
         end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
         max_sigma_m: largest standard deviation of an end across the line.
         max_rms_px: largest residual of a line.
@@ -416,6 +422,7 @@ class TrimConfig(Stage, table="trim"):
     min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)
     min_coverage_count: int = parameter(4, POSITIVE)
     min_coverage_fraction: float = parameter(0.25, SHARE)
+    max_foreshortening: float = parameter(5.0, Rule(">= 1", lambda value: value >= 1))
     end_cluster_px: float = parameter(5.0, POSITIVE)
     max_sigma_m: float = parameter(0.1, POSITIVE)
     max_rms_px: float = parameter(0.65, POSITIVE)

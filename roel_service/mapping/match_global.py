@@ -18,7 +18,7 @@ from roel_service.geometry import plucker
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
 from roel_service.mapping import match_global_kernels
-from roel_service.mapping.contrast import sides_of_lines, with_one_side
+from roel_service.mapping.contrast import bright_sides, sides_of_lines, with_one_side
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames, velocities
@@ -52,7 +52,6 @@ def reassociate(
     trajectory: Trajectory,
     config: Config,
     progress: StepCallback,
-    bright_side: IntArray | None = None,
 ) -> Refined:
     """Let lines collect their observations from all frames, in rounds.
 
@@ -66,11 +65,15 @@ def reassociate(
         config: `match_global` and, for between the rounds, `refine_rounds`. Speeds can be predicted where
             `frames` undoes the camera's rotation.
         progress: called once a round; may raise `Cancelled`.
-        bright_side: (M,) of the observations; lines then keep to those that see the side that most
-            of theirs see. See `contrast`.
     """
     settings = config.match_global
-    velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
+    is_undone = config.frames.compensate_rotation
+    velocity = velocities(frames, trajectory) if is_undone else None
+    bright_side = (
+        bright_sides(observations, frames, trajectory, rotation_is_undone=is_undone)
+        if settings.one_side
+        else None
+    )
     round_count = len(settings.max_distances_px)
     for index, max_distance_px in enumerate(settings.max_distances_px):
         progress(index, round_count)
@@ -78,9 +81,7 @@ def reassociate(
             refined, evidence.views, observations, frames, velocity, max_distance_px, settings
         )
         if bright_side is not None:
-            views = evidence.views
-            own = sides_of_lines(refined.tracks, refined.lines, views, bright_side)
-            found = with_one_side(found, refined.lines, views, bright_side, own)
+            found = _one_sided(found, refined, evidence.views, bright_side)
         refined = _held(refined, found, evidence, frames, config.refine_rounds)
         refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
         exclusive = _exclusive(refined, evidence.views, frames)
@@ -154,6 +155,14 @@ def _associate(
     # One number a pair: they are sorted ten times faster than columns.
     pairs = np.unique(line.astype(np.int64) * len(observations) + member)
     return LineTracks.from_rows(*np.divmod(pairs, max(1, len(observations))), len(refined))
+
+
+def _one_sided(
+    found: LineTracks, refined: Refined, views: Views, bright_side: IntArray
+) -> LineTracks:
+    """Without the observations whose bright side is not that of most that the line had before."""
+    own = sides_of_lines(refined.tracks, refined.lines, views, bright_side)
+    return with_one_side(found, refined.lines, views, bright_side, own)
 
 
 def _along(

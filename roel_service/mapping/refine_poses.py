@@ -19,7 +19,6 @@ from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_points, align_poses
 from roel_service.geometry.se3 import SE3
-from roel_service.mapping.contrast import bright_sides
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
@@ -336,12 +335,6 @@ def _with_own_lines(
 ) -> tuple[Refined, list[JointlyRefined]]:
     """Rounds of matching with the poses as they are, and of refining lines and poses together."""
     refined = _first_lines(detected, config, run)
-    bright_side = bright_sides(
-        detected.observations,
-        detected.frames,
-        smooth,
-        rotation_is_undone=config.frames.compensate_rotation,
-    )
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
     for gate_px in gates_px(config.refine, detected.frames.focal_px):
@@ -357,7 +350,6 @@ def _with_own_lines(
                 poses,
                 gated,
                 run.step,
-                bright_side,
             )
         _check_count(refined)
         with run.stage("refine"):

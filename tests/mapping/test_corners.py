@@ -16,7 +16,10 @@ CORNER = np.array([0.2, 0.1, 0.1])
 HELD = [[CORNER, [0.25, -0.5, 0.2]], [CORNER, [0.7, 0.3, 0.4]]]
 LOOSE = [CORNER, [-0.5, 0.15, 0.0]]
 CONFIG = Config(
-    refine=RefineConfig(direction_sigma_deg=0.0, max_residual_px=20.0, corner_depth_m=0.1),
+    # The loss bends beyond the noise of the sample.
+    refine=RefineConfig(
+        loss_scale_px=0.7, direction_sigma_deg=0.0, max_residual_px=20.0, corner_depth_m=0.1
+    ),
     trim=TrimConfig(min_frame_count=1, min_coverage_count=1, min_support_ratio=0.0),
 )
 FEW_FRAMES = 5

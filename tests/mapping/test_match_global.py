@@ -12,7 +12,11 @@ from roel_service.scene.lines import InfiniteLines, LineTracks
 
 from .synthetic import CAMERA, line_errors, observed, still_frames, world
 
-CONFIG = Config(refine_rounds=RefineRoundsConfig(event_weight=0.0))
+# Polarities of the small world do not turn with the motion, as those of edges do.
+CONFIG = Config(
+    match_global=MatchGlobalConfig(one_side=False),
+    refine_rounds=RefineRoundsConfig(event_weight=0.0),
+)
 
 
 def unwatched(done_count, total_count):
@@ -38,7 +42,7 @@ def reassociated(world, tracks, lines, config=CONFIG, progress=unwatched):
 
 
 def with_rounds(*distances_px, **changes):
-    settings = MatchGlobalConfig(max_distances_px=distances_px, **changes)
+    settings = MatchGlobalConfig(max_distances_px=distances_px, one_side=False, **changes)
     return dataclasses.replace(CONFIG, match_global=settings)
 
 
