@@ -30,8 +30,8 @@ CUBE = """\
 Side 10, a grid of 2 by 2 on every face, looked at from a distance of 25, unit-less. Lines are triangulated
 by preset `paper` with true poses; then every pose but the first gets noise on its position and its Euler
 angles. Errors are root mean squares over the poses in 1/100 units, after alignment by rotation and
-translation, means over the draws of noise; Sim(3) also takes the scale out, which nothing holds in the
-published optimisation. The paper's own figures are 33.25 (none), 32.05 (LIMAP's reprojection), 27.95 (line
+translation, means over the draws of noise; Sim(3) also takes the scale out, which is held at that of the
+given path. The paper's own figures are 33.25 (none), 32.05 (LIMAP's reprojection), 27.95 (line
 Grassmann) and 6.92 (line and event Grassmann). All rows but the last two refine the same tracks with this
 project's solver. `default, in the map` looks for the noisy poses in the map that the default builds with true
 ones, which is as much as the rows above are given; `default` gets the events and the noisy poses alone.
@@ -47,8 +47,8 @@ six, in the world of the given poses: 1 is honest. Rooms marked * were looked at
 """
 
 MAPS = """\
-IoU at 20 mm of the map built with true poses, with refined ones, and with the latter moved by the alignment of
-its poses: refinement cannot know that the world of the given poses lies off.
+IoU at 20 mm of the map built with true poses, with refined ones as `map build --refine-poses` does, and of the
+latter moved by the alignment of its poses: refinement cannot know that the world of the given poses lies off.
 """
 
 

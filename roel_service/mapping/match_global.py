@@ -13,15 +13,17 @@ import numpy as np
 from scipy import sparse
 
 from roel_service.arrays import FloatArray, IntArray
-from roel_service.config.stages import Config, MatchGlobalConfig, RefineRoundsConfig
+from roel_service.config.stages import Config, RefineRoundsConfig
 from roel_service.geometry import plucker
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
+from roel_service.in_order import in_order
 from roel_service.mapping import match_global_kernels
 from roel_service.mapping.contrast import bright_sides, sides_of_lines, with_one_side
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames, velocities
+from roel_service.mapping.front_end import worker_count
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.mapping.trim import covered_spans
 from roel_service.mapping.views import Views, end_residuals_px
@@ -78,7 +80,7 @@ def reassociate(
     for index, max_distance_px in enumerate(settings.max_distances_px):
         progress(index, round_count)
         found = _associate(
-            refined, evidence.views, observations, frames, velocity, max_distance_px, settings
+            refined, evidence.views, observations, frames, velocity, max_distance_px, config
         )
         if bright_side is not None:
             found = _one_sided(found, refined, evidence.views, bright_side)
@@ -111,7 +113,7 @@ def match_fixed_lines(
     settings = config.match_global
     velocity = velocities(frames, trajectory) if config.frames.compensate_rotation else None
     distance_px = settings.max_distances_px[0]
-    pairs = _along(lines, spans, observations, frames, velocity, distance_px, settings)
+    pairs = _along(lines, spans, observations, frames, velocity, distance_px, config)
     stay = replace(config.refine_rounds, iteration_count=0)
     tracks = LineTracks.from_rows(*pairs, len(lines))
     found = _usable(refine_lines(lines, tracks, evidence, frames, stay))
@@ -143,7 +145,7 @@ def _associate(
     frames: Frames,
     velocity: FloatArray | None,
     max_distance_px: float,
-    config: MatchGlobalConfig,
+    config: Config,
 ) -> LineTracks:
     """Each line's inliers so far, and every observation that lies along its projection."""
     spans = _lengthened(refined, views)
@@ -172,7 +174,7 @@ def _along(
     frames: Frames,
     velocity: FloatArray | None,
     max_distance_px: float,
-    config: MatchGlobalConfig,
+    config: Config,
 ) -> tuple[IntArray, IntArray]:
     """Lines (n,) and observations (n,), pairwise, that lie along each other in a frame.
 
@@ -180,10 +182,12 @@ def _along(
         lines: L lines, world.
         spans: (L, 2, 3) the parts of them to look along, world.
         velocity: (N, 3) of the camera, to compare speeds; None leaves them out.
+        config: `match_global`, and the number of threads; frames are independent.
     """
     first = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
-    found: list[IntArray] = [np.empty((2, 0), np.int64)]
-    for frame in range(len(frames)):
+    settings = config.match_global
+
+    def in_frame(frame: int) -> IntArray:
         T_camera_world = frames.T_world_camera[frame].inverse()
         projected = project_segments(spans, T_camera_world, frames)
         image_line, its_rate = _image_lines(lines, frames, frame, velocity)
@@ -195,11 +199,13 @@ def _along(
             observations.segments_px[current],
             observations.normal_speed_px_per_ms[current],
             max_distance_px,
-            config.min_overlap,
-            config.max_speed_difference_px_per_ms if velocity is not None else np.inf,
+            settings.min_overlap,
+            settings.max_speed_difference_px_per_ms if velocity is not None else np.inf,
         )
-        found.append(np.stack([line, member + first[frame]]))
-    line, member = np.concatenate(found, axis=1)
+        return np.stack([line, member + first[frame]])
+
+    found = list(in_order(in_frame, range(len(frames)), worker_count(config)))
+    line, member = np.concatenate([np.empty((2, 0), np.int64), *found], axis=1)
     return line, member
 
 
