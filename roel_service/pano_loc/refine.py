@@ -31,6 +31,8 @@ MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
 MODE_ARC_COUNT, MODE_LINE_COUNT, MODE_STEP_RAD = 200, 600, np.deg2rad(6.0)
 # So many of them are made exact, told apart by points of about so many lines of all lengths.
 FINALIST_COUNT, WEIGHED_LINE_COUNT, WEIGHED_SPACING_M = 6, 800, 0.3
+# Within reach of a prior few poses are apart from one another.
+PRIOR_FINALIST_COUNT = 3
 # Lines near an arc are looked for once for each pose: while it is refined they move by less.
 FINAL_SLACK_RAD, MODE_SLACK_RAD = np.deg2rad(3.0), np.deg2rad(5.0)
 # Poses closer than this in both are one.
@@ -79,7 +81,12 @@ def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
     )
 
 
-def refine_poses(candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Candidates:
+def refine_poses(
+    candidates: Candidates,
+    arcs: PanoramaArcs,
+    prepared: PreparedMap,
+    finalist_count: int = FINALIST_COUNT,
+) -> Candidates:
     """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
     modes = _refined(
@@ -90,16 +97,16 @@ def refine_poses(candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedM
         MODE_SLACK_RAD,
         MODE_LINE_COUNT,
     )
-    best = distinct(_weighed(modes, arcs, prepared), FINALIST_COUNT)
+    if len(modes) > finalist_count:
+        modes = _weighed(modes, arcs, prepared)
+    best = distinct(modes, finalist_count)
     samples = sample_arcs(arcs, FINAL_STEP_RAD)
     refined = _refined(best, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared))
-    return distinct(refined, FINALIST_COUNT)
+    return distinct(refined, finalist_count)
 
 
 def _weighed(modes: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Candidates:
     """Modes scored in both directions: a map of many rooms explains much of any picture."""
-    if len(modes) <= FINALIST_COUNT:
-        return modes
     stride = -(-len(prepared) // WEIGHED_LINE_COUNT)
     lines = LinePoints.of(prepared.segments[::stride], WEIGHED_SPACING_M)
 
@@ -149,9 +156,10 @@ def _refined(
 
     def refined(pose: SE3) -> tuple[SE3, float]:
         lines = prepared.widest(pose.translation, line_count)
-        nearby = lines_nearby(pose, samples, lines, slack_rad)
+        nearby = lines_nearby(pose, samples, lines, widths_rad[0], slack_rad)
         for width_rad in widths_rad:
-            step = _step(*equations(pose, samples, lines, nearby, width_rad))
+            found = match(pose, samples, lines, nearby, FINAL_GATE_RAD)
+            step = _step(*equations(found, samples, lines, width_rad))
             pose = pose.retract(step)
             if width_rad == widths_rad[-1] and np.linalg.norm(step) < CONVERGED:
                 break
@@ -186,9 +194,18 @@ class Matches:
 
 
 def lines_nearby(
-    pose: SE3, samples: Samples, prepared: PreparedMap, slack_rad: float = 0.0
+    pose: SE3,
+    samples: Samples,
+    prepared: PreparedMap,
+    width_rad: float,
+    slack_rad: float = 0.0,
 ) -> Nearby:
-    """Lines that rays of each arc may lie on at this pose, and at others that are close to it."""
+    """Lines that rays of each arc may lie on at this pose, and at others that are close to it.
+
+    Args:
+        width_rad: the greatest of the kernel that weighs the rays.
+        slack_rad: how much closer they may come at the other poses.
+    """
     return refine_kernels.nearby_lines(
         samples.middles @ pose.rotation.T,
         samples.reach_rad,
@@ -196,6 +213,7 @@ def lines_nearby(
         prepared.directions,
         refine_kernels.viewed_lines(prepared.segments, pose.translation),
         GATE_RAD,
+        refine_kernels.CUTOFF_WIDTHS * width_rad,
         slack_rad,
     )
 
@@ -213,10 +231,9 @@ def match(
 
 
 def equations(
-    pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby, width_rad: float
+    found: Matches, samples: Samples, prepared: PreparedMap, width_rad: float
 ) -> tuple[FloatArray, FloatArray]:
     """(6, 6) of the Gauss-Newton step at a pose, and (L, 6) gradient by line; tangent (r, d)."""
-    found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
     H, g = refine_kernels.normal_equations(
         found.rays,
         samples.weight,

@@ -14,6 +14,8 @@ END_SLACK_RAD = np.deg2rad(1.5)
 END_SLACK_SINE = np.sin(END_SLACK_RAD)
 # Viewing planes of arc and line differ by no more than this, or the arc's own error if larger.
 MIN_NORMAL_GATE_RAD = np.deg2rad(15.0)
+# Rays that are off by more widths of the kernel do not count.
+CUTOFF_WIDTHS = 3.0
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -64,23 +66,35 @@ def viewed_lines(
 
 @numba.njit(cache=True, nogil=True)
 def _mark_alike(
-    arc_normal: Array,
-    middle: Array,
+    arc: Array,
     planes: Array,
     ways: Array,
-    cosine: np.float32,
-    sine: np.float32,
-    aside_sine: np.float32,
-    alike: BoolArray,
+    min_cosine: np.float32,
+    max_sine: np.float32,
+    reach: Array,
+    max_off: np.float32,
+    alike: Array,
 ) -> None:
-    """Mark lines whose viewing planes (3, L) and directions (3, L) agree with an arc's."""
-    nx, ny, nz = arc_normal
-    x, y, z = middle
-    for j in range(len(alike)):
-        plane = abs(nx * planes[0, j] + ny * planes[1, j] + nz * planes[2, j])
+    """Mark lines whose viewing planes (3, L) and directions (3, L) agree with an arc's.
+
+    Args:
+        arc: (3, 3) rows are the arc's normal, its middle and what is across both.
+        planes, ways: as said.
+        min_cosine, max_sine: between the normals of both, and of arc and direction.
+        reach: (2,) cosine and sine of half the arc's length.
+        max_off: sine of the angle by which the arc's nearest ray may be off the plane.
+        alike: (L,) or longer, the result.
+    """
+    nx, ny, nz = arc[0]
+    mx, my, mz = arc[1]
+    ax, ay, az = arc[2]
+    for j in range(planes.shape[1]):
+        px, py, pz = planes[0, j], planes[1, j], planes[2, j]
+        plane = abs(nx * px + ny * py + nz * pz)
         way = abs(nx * ways[0, j] + ny * ways[1, j] + nz * ways[2, j])
-        aside = abs(x * planes[0, j] + y * planes[1, j] + z * planes[2, j])
-        alike[j] = (plane >= cosine) & (way <= sine) & (aside <= aside_sine)
+        middle, across = abs(mx * px + my * py + mz * pz), abs(ax * px + ay * py + az * pz)
+        off = reach[0] * middle - reach[1] * across
+        alike[j] = (plane >= min_cosine) & (way <= max_sine) & (off <= max_off)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -91,6 +105,7 @@ def nearby_lines(
     directions: FloatArray,
     seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
     max_angle_rad: float,
+    max_residual_rad: float,
     slack_rad: float,
 ) -> tuple[IntArray, IntArray]:
     """Lines that rays of an arc may lie on, also at poses that are a little off.
@@ -102,6 +117,7 @@ def nearby_lines(
         directions: (L, 3) unit, of the lines.
         seen: what `viewed_lines` found.
         max_angle_rad: between arcs and lines, as `match_rays` has it.
+        max_residual_rad: rays that are farther off a line do not count.
         slack_rad: how much more is allowed for other poses.
 
     Returns:
@@ -111,37 +127,39 @@ def nearby_lines(
     offsets = np.zeros(len(normals) + 1, np.int64)
     lines = np.empty(16 * len(normals) + 16, np.int64)
     count = 0
-    sine = np.sin(max_angle_rad + slack_rad)
-    cosine = np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD) + slack_rad)
-    # By coordinate and short, so that one instruction takes several lines.
+    min_cosine = np.float32(np.cos(max(max_angle_rad, MIN_NORMAL_GATE_RAD) + slack_rad))
+    max_sine = np.float32(np.sin(max_angle_rad + slack_rad))
+    max_off = np.float32(np.sin(min(max_residual_rad + slack_rad, np.pi / 2)))
+    # By coordinate and short, so that one instruction takes several lines; few are alike, so that
+    # eight at a time are passed over.
     planes = np.ascontiguousarray(normal.T.astype(np.float32))
     ways = np.ascontiguousarray(directions.T.astype(np.float32))
-    alike = np.empty(len(directions), np.bool_)
+    alike = np.zeros((len(directions) + 7) // 8 * 8, np.uint8)
+    eights = alike.view(np.uint64)
+    arc, reach = np.empty((3, 3), np.float32), np.empty(2, np.float32)
+    across = np.empty(3)
     for a in range(len(normals)):
-        aside = np.sin(min(reach_rad[a] + max_angle_rad + slack_rad, np.pi / 2))
-        _mark_alike(
-            normals[a].astype(np.float32),
-            middles[a].astype(np.float32),
-            planes,
-            ways,
-            np.float32(cosine),
-            np.float32(sine),
-            np.float32(aside),
-            alike,
-        )
+        _cross(normals[a], middles[a], across)
+        arc[0], arc[1], arc[2] = normals[a], middles[a], across
+        half_rad = min(reach_rad[a], np.pi / 2)
+        reach[0], reach[1] = np.cos(half_rad), np.sin(half_rad)
+        _mark_alike(arc, planes, ways, min_cosine, max_sine, reach, max_off, alike)
         x, y, z = middles[a]
         beyond = -np.sin(min(reach_rad[a] + END_SLACK_RAD + slack_rad, np.pi / 2))
-        for j in range(len(directions)):
-            if not (alike[j] and sound[j]):
+        for eight in range(len(eights)):
+            if eights[eight] == 0:
                 continue
-            if x * from_start[j, 0] + y * from_start[j, 1] + z * from_start[j, 2] < beyond:
-                continue
-            if x * to_end[j, 0] + y * to_end[j, 1] + z * to_end[j, 2] < beyond:
-                continue
-            if count == len(lines):
-                lines = np.concatenate((lines, np.empty_like(lines)))
-            lines[count] = j
-            count += 1
+            for j in range(8 * eight, min(8 * eight + 8, len(directions))):
+                if not (alike[j] and sound[j]):
+                    continue
+                if x * from_start[j, 0] + y * from_start[j, 1] + z * from_start[j, 2] < beyond:
+                    continue
+                if x * to_end[j, 0] + y * to_end[j, 1] + z * to_end[j, 2] < beyond:
+                    continue
+                if count == len(lines):
+                    lines = np.concatenate((lines, np.empty_like(lines)))
+                lines[count] = j
+                count += 1
         offsets[a + 1] = count
     return offsets, lines[:count]
 
@@ -190,13 +208,14 @@ def match_rays(
             tx, ty, tz = to_end[j, 0], to_end[j, 1], to_end[j, 2]
             for s in range(offsets[a], offsets[a + 1]):
                 x, y, z = rays[s, 0], rays[s, 1], rays[s, 2]
+                off = x * mx + y * my + z * mz
+                if line[s] >= 0 and abs(off) >= abs(residual[s]):
+                    continue
                 if x * fx + y * fy + z * fz < -END_SLACK_SINE:
                     continue
                 if x * tx + y * ty + z * tz < -END_SLACK_SINE:
                     continue
-                off = x * mx + y * my + z * mz
-                if line[s] < 0 or abs(off) < abs(residual[s]):
-                    line[s], residual[s] = j, off
+                line[s], residual[s] = j, off
     return line, residual
 
 
@@ -220,7 +239,7 @@ def normal_equations(
     J = np.empty(6)
     for s in range(len(rays)):
         j = line[s]
-        if j < 0 or abs(residual[s]) > 3.0 * scale_rad:
+        if j < 0 or abs(residual[s]) > CUTOFF_WIDTHS * scale_rad:
             continue
         jacobian(rays[s], segments[j], normal[j], moment[j], J)
         robust = weight[s] / (1.0 + (residual[s] / scale_rad) ** 2) ** 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
-from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
 from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.prepare import BEARING_COUNT, VIEW_LINE_COUNT, PreparedMap
 from roel_service.pano_loc.views import Pane, agreement, pane_of, views_around, views_from
@@ -191,7 +192,9 @@ def _moved(
     axis = step_m * np.array([-1.0, 0.0, 1.0])
     around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
     places, scores = seeds.places.copy(), seeds.score.copy()
-    for index in np.unique(seeds.rotation):
+
+    def move(index: int) -> None:
+        """Those of one orientation, in place."""
         pane = pane_of(arcs, rotations[index], prepared.lines.frames, step_m, FINE_BEARING_COUNT)
         for member in np.flatnonzero(seeds.rotation == index):
             views = views_around(
@@ -201,6 +204,9 @@ def _moved(
             best = int(score.argmax())
             places[member] += around[best]
             scores[member] = score[best]
+
+    with ThreadPoolExecutor(THREAD_COUNT) as threads:
+        list(threads.map(move, np.unique(seeds.rotation)))
     return _Seeds(rotation=seeds.rotation, places=places, score=scores)
 
 

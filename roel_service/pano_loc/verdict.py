@@ -24,6 +24,7 @@ from roel_service.pano_loc.refine import (
     match,
     sample_arcs,
 )
+from roel_service.pano_loc.refine_kernels import CUTOFF_WIDTHS
 from roel_service.pano_loc.search import Candidates
 from roel_service.scene.results import (
     LocalizationStatus,
@@ -187,16 +188,16 @@ def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap) -> FloatArra
     All samples of a line err together, and lines err independently. Where residuals are larger than
     those of the detector, the map is off, and that lines share: see `_inflation`.
     """
-    nearby = lines_nearby(pose, samples, prepared)
     width_rad = FINAL_WIDTHS_RAD[-1]
-    H, gradients = equations(pose, samples, prepared, nearby, width_rad)
+    nearby = lines_nearby(pose, samples, prepared, width_rad)
+    found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
+    H, gradients = equations(found, samples, prepared, width_rad)
     inverse = np.linalg.inv(H + WEAKEST * np.eye(6))
     pull = gradients.T @ gradients
     line_count = int(np.count_nonzero(gradients.any(axis=1)))
     few = line_count / max(line_count - 6, 1)
     floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-    found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
-    used = (found.line >= 0) & (np.abs(found.residual) < 3.0 * width_rad)
+    used = (found.line >= 0) & (np.abs(found.residual) < CUTOFF_WIDTHS * width_rad)
     mean_square = samples.weight[used] @ found.residual[used] ** 2
     mean_square /= max(samples.weight[used].sum(), 1e-9)
     sandwich = few * inverse @ pull @ inverse + floor

@@ -14,7 +14,13 @@ from roel_service.pano_loc.arcs import detect_arcs
 from roel_service.pano_loc.fgpl.localize import FgplMap, localize_fgpl, prepare_fgpl
 from roel_service.pano_loc.fgpl.parameters import FgplParameters
 from roel_service.pano_loc.prepare import PreparedMap, prepare_map
-from roel_service.pano_loc.refine import FINAL_STEP_RAD, explained, lines_nearby, sample_arcs
+from roel_service.pano_loc.refine import (
+    FINAL_STEP_RAD,
+    FINAL_WIDTHS_RAD,
+    explained,
+    lines_nearby,
+    sample_arcs,
+)
 from roel_service.pano_loc.search import Candidates
 from roel_service.pano_loc.verdict import Found, enough_arcs, hypotheses, judge
 from roel_service.scene.lines import LineMap
@@ -58,7 +64,8 @@ def localize_judged(
         return judge([], arcs, config)
     pose, judging = found.T_world_panorama, maps[found.map_index].judging
     samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    explained_2d = explained(pose, samples, judging, lines_nearby(pose, samples, judging))
+    nearby = lines_nearby(pose, samples, judging, FINAL_WIDTHS_RAD[0])
+    explained_2d = explained(pose, samples, judging, nearby)
     candidate = Candidates(
         poses=SE3(rotation=pose.rotation[None], translation=pose.translation[None]),
         score=np.array([explained_2d]),
