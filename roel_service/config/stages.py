@@ -486,7 +486,7 @@ class LocalizeConfig(Stage, table="localize"):
         candidate_count: poses whose neighbourhood is searched.
         max_hypothesis_count: poses at the most in an answer.
         min_score: a pose that explains less of picture and map together is none; a fifth of its
-            margin is added.
+            margin is added, and fewer lines in the picture ask for more.
         min_coverage: nor is one at which the picture shows less of the map's lines.
         min_margin: a runner-up this close below the best pose, as a share of its score, leaves the
             answer open.
@@ -500,8 +500,8 @@ class LocalizeConfig(Stage, table="localize"):
     max_rotation_count: int = parameter(64, at_most(1000))
     candidate_count: int = parameter(72, at_most(1000))
     max_hypothesis_count: int = parameter(5, Rule("1 to 5", lambda value: 1 <= value <= 5))
-    min_score: float = parameter(0.3, SHARE)
-    min_coverage: float = parameter(0.1, SHARE)
+    min_score: float = parameter(0.2, SHARE)
+    min_coverage: float = parameter(0.06, SHARE)
     min_margin: float = parameter(0.12, SHARE)
 
 

@@ -12,7 +12,14 @@ from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import refine_kernels
 from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
-from roel_service.pano_loc.coverage import GATE_RAD, WIDTH_RAD, LinePoints, covered, two_way_score
+from roel_service.pano_loc.coverage import (
+    CROWD_REACH_RAD,
+    GATE_RAD,
+    LinePoints,
+    covered,
+    credit,
+    two_way_score,
+)
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.search import Candidates
 
@@ -156,7 +163,8 @@ def _refined(
 
     def refined(pose: SE3) -> tuple[SE3, float]:
         lines = prepared.widest(pose.translation, line_count)
-        nearby = lines_nearby(pose, samples, lines, widths_rad[0], slack_rad)
+        max_residual_rad = refine_kernels.CUTOFF_WIDTHS * widths_rad[0]
+        nearby = lines_nearby(pose, samples, lines, max_residual_rad, slack_rad)
         for width_rad in widths_rad:
             found = match(pose, samples, lines, nearby, FINAL_GATE_RAD)
             step = _step(*equations(found, samples, lines, width_rad))
@@ -197,13 +205,13 @@ def lines_nearby(
     pose: SE3,
     samples: Samples,
     prepared: PreparedMap,
-    width_rad: float,
+    max_residual_rad: float,
     slack_rad: float = 0.0,
 ) -> Nearby:
     """Lines that rays of each arc may lie on at this pose, and at others that are close to it.
 
     Args:
-        width_rad: the greatest of the kernel that weighs the rays.
+        max_residual_rad: rays that are farther off a line do not count.
         slack_rad: how much closer they may come at the other poses.
     """
     return refine_kernels.nearby_lines(
@@ -213,7 +221,7 @@ def lines_nearby(
         prepared.directions,
         refine_kernels.viewed_lines(prepared.segments, pose.translation),
         GATE_RAD,
-        refine_kernels.CUTOFF_WIDTHS * width_rad,
+        max_residual_rad,
         slack_rad,
     )
 
@@ -247,10 +255,22 @@ def equations(
 
 
 def explained(pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby) -> float:
-    """Share of the arcs' length that lines of the map explain, 0 to 1."""
-    found = match(pose, samples, prepared, nearby, GATE_RAD)
-    fit = np.where(found.line >= 0, np.exp(-0.5 * (found.residual / WIDTH_RAD) ** 2), 0.0)
-    return float(samples.weight @ fit / max(samples.weight.sum(), 1e-9))
+    """Share of the arcs' length that lines of the map explain, 0 to 1.
+
+    Args:
+        nearby: lines that are closer than `CROWD_REACH_RAD`; of fewer, crowds look smaller.
+    """
+    off, crowd = refine_kernels.crowd_on_rays(
+        samples.rays @ pose.rotation.T,
+        samples.offsets,
+        samples.normals @ pose.rotation.T,
+        prepared.directions,
+        refine_kernels.viewed_lines(prepared.segments, pose.translation),
+        nearby,
+        GATE_RAD,
+        CROWD_REACH_RAD,
+    )
+    return float(samples.weight @ credit(off, crowd) / max(samples.weight.sum(), 1e-9))
 
 
 def _step(H: FloatArray, gradients: FloatArray) -> FloatArray:

@@ -220,6 +220,52 @@ def match_rays(
 
 
 @numba.njit(cache=True, nogil=True)
+def crowd_on_rays(
+    rays: FloatArray,
+    offsets: IntArray,
+    normals: FloatArray,
+    directions: FloatArray,
+    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray],
+    nearby: tuple[IntArray, IntArray],
+    max_angle_rad: float,
+    reach_rad: float,
+) -> tuple[FloatArray, IntArray]:
+    """(S,) sine of the angle to the nearest line of each ray, and (S,) lines within reach of it.
+
+    Infinite where no line is within reach. Lines must have the arc's direction, and hold the ray
+    between their ends.
+
+    Args:
+        rays, offsets, normals, directions, seen, nearby, max_angle_rad: as `match_rays` has them.
+        reach_rad: as said.
+    """
+    normal, _, from_start, to_end, sound = seen
+    first, near = nearby
+    least, count = np.full(len(rays), np.inf), np.zeros(len(rays), np.int64)
+    sine, reach = np.sin(max_angle_rad), np.sin(reach_rad)
+    for a in range(len(normals)):
+        for index in range(first[a], first[a + 1]):
+            j = near[index]
+            if not sound[j] or abs(_dot(normals[a], directions[j])) > sine:
+                continue
+            mx, my, mz = normal[j, 0], normal[j, 1], normal[j, 2]
+            fx, fy, fz = from_start[j, 0], from_start[j, 1], from_start[j, 2]
+            tx, ty, tz = to_end[j, 0], to_end[j, 1], to_end[j, 2]
+            for s in range(offsets[a], offsets[a + 1]):
+                x, y, z = rays[s, 0], rays[s, 1], rays[s, 2]
+                off = abs(x * mx + y * my + z * mz)
+                if off > reach:
+                    continue
+                if x * fx + y * fy + z * fz < -END_SLACK_SINE:
+                    continue
+                if x * tx + y * ty + z * tz < -END_SLACK_SINE:
+                    continue
+                count[s] += 1
+                least[s] = min(least[s], off)
+    return least, count
+
+
+@numba.njit(cache=True, nogil=True)
 def normal_equations(
     rays: FloatArray,
     weight: FloatArray,
@@ -288,10 +334,11 @@ def match_points(
     from_start: FloatArray,
     to_end: FloatArray,
     max_angle_rad: float,
-) -> FloatArray:
-    """(P,) least angle, rad, between points of map lines and arcs alike in direction.
+    reach_rad: float,
+) -> tuple[FloatArray, IntArray]:
+    """(P,) sine of the angle from points of map lines to the nearest arc, (P,) arcs within reach.
 
-    Infinite where no arc passes.
+    Infinite where no arc is within reach. Arcs must be alike in direction.
 
     Args:
         points: (P, 3) unit rays, panorama frame; those of line j are offsets[j]:offsets[j + 1].
@@ -299,24 +346,25 @@ def match_points(
         directions: (L, 3) unit, of the lines, panorama frame.
         normals: (A, 3) unit, of the arcs.
         from_start, to_end: (A, 3) unit, normal x start and end x normal.
-        max_angle_rad: gate.
+        max_angle_rad: between the directions.
+        reach_rad: as said.
     """
-    nearest = np.full(len(points), np.inf)
-    sine = np.sin(max_angle_rad)
+    nearest, crowd = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+    sine, within = np.sin(max_angle_rad), np.sin(reach_rad)
     # By coordinate and short, so that one instruction takes several arcs.
     columns = np.ascontiguousarray(normals.T.astype(np.float32))
     near, alike = np.empty(len(normals), np.bool_), np.empty(len(normals), np.int64)
     for j in range(len(directions)):
         first, last = offsets[j], offsets[j + 1]
         middle = points[(first + last) // 2]
-        reach = min(_dot(middle, points[first]), _dot(middle, points[last - 1]))
-        reach_rad = np.arccos(max(-1.0, min(1.0, reach))) + max_angle_rad
+        half = min(_dot(middle, points[first]), _dot(middle, points[last - 1]))
+        half_rad = np.arccos(max(-1.0, min(1.0, half)))
         _mark_passing(
             directions[j].astype(np.float32),
             middle.astype(np.float32),
             columns,
             np.float32(sine),
-            np.float32(np.sin(min(reach_rad, np.pi / 2))),
+            np.float32(np.sin(min(half_rad + reach_rad, np.pi / 2))),
             near,
         )
         count = 0
@@ -326,14 +374,14 @@ def match_points(
                 count += 1
         for p in range(first, last):
             x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            least = sine
             for index in range(count):
                 a = alike[index]
                 off = abs(x * normals[a, 0] + y * normals[a, 1] + z * normals[a, 2])
-                if off > least:
+                if off > within:
                     continue
                 ahead = x * from_start[a, 0] + y * from_start[a, 1] + z * from_start[a, 2]
                 behind = x * to_end[a, 0] + y * to_end[a, 1] + z * to_end[a, 2]
                 if min(ahead, behind) >= -END_SLACK_SINE:
-                    least, nearest[p] = off, np.arcsin(off)
-    return nearest
+                    crowd[p] += 1
+                    nearest[p] = min(nearest[p], off)
+    return nearest, crowd

@@ -13,7 +13,14 @@ from roel_service.geometry.se3 import SE3
 from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
 from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.prepare import BEARING_COUNT, VIEW_LINE_COUNT, PreparedMap
-from roel_service.pano_loc.views import Pane, agreement, pane_of, views_around, views_from
+from roel_service.pano_loc.views import (
+    CLAIM_BEARING_COUNT,
+    Pane,
+    agreement,
+    pane_of,
+    views_around,
+    views_from,
+)
 
 # Places within reach of a prior are tried at this spacing, and so much fewer candidates stay.
 PRIOR_STEP_M, PRIOR_CANDIDATE_SHARE = 0.25, 1 / 3
@@ -28,8 +35,9 @@ SUPPRESSION_M = 0.5
 CONSIDERED_PLACE_COUNT = 60
 # Beyond chance, and by likelihood: the columns of `agreement`.
 RANKINGS = (0, 1)
-# Rounds around the best: the share of the candidates that takes part, and how much finer the grid.
-ROUNDS = ((1.0, 3), (0.35, 3), (0.35, 9))
+# Rounds around the best: the share of the candidates that takes part, how much finer the grid is, and
+# in how many bearings a line hides others: few where lines are to tell the place exactly.
+ROUNDS = ((1.0, 3, CLAIM_BEARING_COUNT), (0.35, 3, CLAIM_BEARING_COUNT), (0.35, 9, 1))
 FINE_LINE_COUNT, FINE_BEARING_COUNT = 300, 360
 
 
@@ -113,9 +121,11 @@ def coarse_candidates(
     found = []
     for kind in RANKINGS:
         seeds = _best_of_all(places, scores[:, :, kind])
-        for share, finer in ROUNDS:
+        for share, finer, claim_bearing_count in ROUNDS:
             seeds = seeds.best(max(1, round(share * candidate_count)))
-            seeds = _moved(seeds, kind, arcs, prepared, rotations, step_m / finer)
+            seeds = _moved(
+                seeds, kind, arcs, prepared, rotations, step_m / finer, claim_bearing_count
+            )
         found.append(seeds)
     rotation = np.concatenate([seeds.rotation for seeds in found])
     poses = SE3(
@@ -187,6 +197,7 @@ def _moved(
     prepared: PreparedMap,
     rotations: FloatArray,
     step_m: float,
+    claim_bearing_count: int,
 ) -> _Seeds:
     """Each at the best place of a finer grid around it, as one of the two scores says."""
     axis = step_m * np.array([-1.0, 0.0, 1.0])
@@ -198,7 +209,11 @@ def _moved(
         pane = pane_of(arcs, rotations[index], prepared.lines.frames, step_m, FINE_BEARING_COUNT)
         for member in np.flatnonzero(seeds.rotation == index):
             views = views_around(
-                prepared.lines, places[member] + around, FINE_BEARING_COUNT, FINE_LINE_COUNT
+                prepared.lines,
+                places[member] + around,
+                FINE_BEARING_COUNT,
+                FINE_LINE_COUNT,
+                claim_bearing_count,
             )
             score = agreement(views, [pane])[0, :, kind]
             best = int(score.argmax())

@@ -12,14 +12,16 @@ from roel_service.arrays import FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
-from roel_service.pano_loc.coverage import LinePoints, covered, two_way_score
+from roel_service.pano_loc.coverage import CROWD_REACH_RAD, LinePoints, covered, two_way_score
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import (
     FINAL_GATE_RAD,
     FINAL_STEP_RAD,
     FINAL_WIDTHS_RAD,
+    Nearby,
     Samples,
     equations,
+    explained,
     lines_nearby,
     match,
     sample_arcs,
@@ -43,6 +45,9 @@ SAME_ANSWER_M, SAME_ANSWER_RAD = 0.3, np.deg2rad(15.0)
 # Along a direction that is less certain than this there is no answer.
 MAX_SIGMA_M, MAX_SIGMA_RAD = 0.3, np.deg2rad(15.0)
 POINT_SPACING_M = 0.1
+# The best of many poses stands out by chance the farther, the fewer the arcs: a share of their scores
+# varies with the root of their number.
+CHANCE = 0.5
 # A pose that stands out needs less of a score: where walls hide most of a map, scores are low.
 MARGIN_WEIGHT = 0.2
 # What nothing holds gets a variance of 1, rad^2 or m^2.
@@ -84,15 +89,14 @@ def enough_lines(prepared: PreparedMap) -> bool:
 def hypotheses(
     candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, map_index: int
 ) -> tuple[PoseHypothesis, ...]:
-    """The candidates, weighed in both directions; their scores are the shares of arcs explained."""
+    """The candidates, weighed in both directions."""
     samples, lines = (
         sample_arcs(arcs, FINAL_STEP_RAD),
         LinePoints.of(prepared.segments, POINT_SPACING_M),
     )
 
     def weighed(index: int) -> PoseHypothesis:
-        pose, explained_2d = candidates.poses[index], float(candidates.score[index])
-        return _hypothesis(pose, explained_2d, arcs, samples, lines, prepared, map_index)
+        return _hypothesis(candidates.poses[index], arcs, samples, lines, prepared, map_index)
 
     with ThreadPoolExecutor(THREAD_COUNT) as threads:
         return tuple(threads.map(weighed, range(len(candidates))))
@@ -113,7 +117,8 @@ def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig)
         tried = any(one.candidate_count for one in searched)
         reason = NoPoseReason.NOT_IN_MAP if tried else NoPoseReason.DEGENERATE
     else:
-        reason = _reason(found[0], margin, config)
+        min_evidence = config.min_score + CHANCE / np.sqrt(len(arcs))
+        reason = _reason(found[0], margin, min_evidence, config)
     status = {
         None: LocalizationStatus.FOUND,
         NoPoseReason.AMBIGUOUS: LocalizationStatus.AMBIGUOUS,
@@ -130,13 +135,15 @@ def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig)
     )
 
 
-def _reason(best: PoseHypothesis, margin: float, config: LocalizeConfig) -> NoPoseReason | None:
+def _reason(
+    best: PoseHypothesis, margin: float, min_evidence: float, config: LocalizeConfig
+) -> NoPoseReason | None:
     """Why the best pose may not be relied on; None if it may."""
     sigma = np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1])
     sigma_m = np.sqrt(np.linalg.eigvalsh(best.covariance[3:, 3:])[-1])
     # Without another pose nothing says that this one stands out.
     evidence = best.score + (MARGIN_WEIGHT * margin if margin < 1.0 else 0.0)
-    if evidence < config.min_score or best.explained_3d < config.min_coverage:
+    if evidence < min_evidence or best.explained_3d < config.min_coverage:
         return NoPoseReason.NOT_IN_MAP
     if sigma > MAX_SIGMA_RAD or sigma_m > MAX_SIGMA_M:
         return NoPoseReason.DEGENERATE
@@ -164,32 +171,32 @@ def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
 
 def _hypothesis(
     pose: SE3,
-    explained_2d: float,
     arcs: PanoramaArcs,
     samples: Samples,
     lines: LinePoints,
     prepared: PreparedMap,
     map_index: int,
 ) -> PoseHypothesis:
+    nearby = lines_nearby(pose, samples, prepared, CROWD_REACH_RAD)
+    explained_2d = explained(pose, samples, prepared, nearby)
     explained_3d = covered(pose, arcs, lines)
     return PoseHypothesis(
         T_world_panorama=pose,
         score=two_way_score(explained_2d, explained_3d),
-        covariance=_covariance(pose, samples, prepared),
+        covariance=_covariance(pose, samples, prepared, nearby),
         explained_2d=explained_2d,
         explained_3d=explained_3d,
         map_index=map_index,
     )
 
 
-def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap) -> FloatArray:
+def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby) -> FloatArray:
     """(6, 6) of (r, d): what the residuals of whole lines say about each other's pull.
 
     All samples of a line err together, and lines err independently. Where residuals are larger than
     those of the detector, the map is off, and that lines share: see `_inflation`.
     """
     width_rad = FINAL_WIDTHS_RAD[-1]
-    nearby = lines_nearby(pose, samples, prepared, width_rad)
     found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
     H, gradients = equations(found, samples, prepared, width_rad)
     inverse = np.linalg.inv(H + WEAKEST * np.eye(6))

@@ -25,6 +25,9 @@ CLASS_SINE = np.sin(np.deg2rad(4.0))
 DIRECTION_SLACK_RAD = np.deg2rad(1.0)
 # Places of which all lines are compared at once.
 CHUNK_PLACE_COUNT = 256
+# Where lines crowd, arcs lie on some of them by chance: of what takes up the same steps of so many
+# bearings, the widest line alone counts at first.
+CLAIM_BEARING_COUNT = 2
 # At this distance a picture is painted wide enough for a quarter of a cell of places.
 SLACK_DISTANCE_M = 1.0
 
@@ -99,17 +102,21 @@ def views_from(
         ]
         or [np.empty((0, line_count), np.int64)]
     )
-    return _views_of(lines, inside, chosen, bearing_count)
+    return _views_of(lines, inside, chosen, bearing_count, CLAIM_BEARING_COUNT)
 
 
 def views_around(
-    lines: ClassedLines, places: FloatArray, bearing_count: int, line_count: int
+    lines: ClassedLines,
+    places: FloatArray,
+    bearing_count: int,
+    line_count: int,
+    claim_bearing_count: int,
 ) -> Views:
     """The same from (T, 3) places around one, whose lines they share."""
     inside = _inside(lines, places)
     middle = inside.mean(axis=0, keepdims=True)
     chosen = np.repeat(widest(lines, middle, line_count), len(places), axis=0)
-    return _views_of(lines, inside, chosen, bearing_count)
+    return _views_of(lines, inside, chosen, bearing_count, claim_bearing_count)
 
 
 def _inside(lines: ClassedLines, places: FloatArray) -> FloatArray:
@@ -127,11 +134,15 @@ def widest(lines: ClassedLines, inside: FloatArray, count: int) -> IntArray:
 
 
 def _views_of(
-    lines: ClassedLines, inside: FloatArray, chosen: IntArray, bearing_count: int
+    lines: ClassedLines,
+    inside: FloatArray,
+    chosen: IntArray,
+    bearing_count: int,
+    claim_bearing_count: int,
 ) -> Views:
     """What (T, M) chosen lines look like from (T, K, 3) places."""
     slots, words, kinds = views_kernels.views(
-        lines.feet, lines.which, inside, chosen, bearing_count, SHELL_ENDS_M
+        lines.feet, lines.which, inside, chosen, bearing_count, claim_bearing_count, SHELL_ENDS_M
     )
     everything = np.full(len(lines.frames) * bearing_count, ~np.uint64(0))
     sizes = _sizes(slots, words, kinds, everything, len(lines.frames))

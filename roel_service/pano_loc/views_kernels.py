@@ -90,6 +90,7 @@ def views(
     places: FloatArray,
     chosen: IntArray,
     bearing_count: int,
+    claim_bearing_count: int,
     shell_ends_m: FloatArray,
 ) -> tuple[Array, Array, Array]:
     """Lines as seen from places.
@@ -101,6 +102,8 @@ def views(
         places: (T, K, 3) in the axes of each class, m.
         chosen: (T, M) lines that are looked at from each place.
         bearing_count: B.
+        claim_bearing_count: of what takes up the same steps of so many bearings, the first line
+            alone counts; 0 if each counts.
         shell_ends_m: (S - 1,) distances that part the shells.
 
     Returns:
@@ -111,18 +114,23 @@ def views(
     words = np.empty(chosen.shape, np.uint64)
     kinds = np.empty(chosen.shape, np.uint8)
     per_rad, shell_count = bearing_count / (2.0 * np.pi), len(shell_ends_m) + 1
+    claimed = np.zeros(places.shape[1] * bearing_count, np.uint64)
     for t in range(len(places)):
+        claimed[:] = 0
         for m in range(chosen.shape[1]):
             j = chosen[t, m]
             k = which[j]
             across, aside = feet[j, 0] - places[t, k, 0], feet[j, 1] - places[t, k, 1]
             low, high = feet[j, 2] - places[t, k, 2], feet[j, 3] - places[t, k, 2]
             away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
-            words[t, m] = _word(
-                _arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD
-            )
-            bearing = int(_bearing(across, aside) * per_rad)
-            slots[t, m] = k * bearing_count + min(bearing, bearing_count - 1)
+            bearing = min(int(_bearing(across, aside) * per_rad), bearing_count - 1)
+            slots[t, m] = k * bearing_count + bearing
+            steps = _word(_arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD)
+            words[t, m] = steps
+            if claim_bearing_count > 0:
+                claim = k * bearing_count + bearing - bearing % claim_bearing_count
+                words[t, m] &= ~claimed[claim]
+                claimed[claim] |= steps
             ahead = max(0.0, low, -high)
             distance_m = np.sqrt(away * away + ahead * ahead)
             shell = 0

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from roel_service.geometry.segments import length
-from roel_service.pano_loc.coverage import LinePoints, covered, two_way_score
+from roel_service.pano_loc.coverage import LinePoints, covered, credit, two_way_score
 from tests.pano_loc.rooms import pose, seen_from, segments_of
 
 TRUTH = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
@@ -30,6 +30,14 @@ def test_of_half_the_lines_about_half_is_shown():
     assert 0.3 < shown < 0.8
 
 
-def test_the_picture_counts_twice_as_much_as_the_map():
+def test_the_picture_counts_four_times_as_much_as_the_map():
     assert two_way_score(1.0, 1.0) == 1.0
-    assert two_way_score(1.0, 0.0) == pytest.approx(2 * two_way_score(0.0, 1.0))
+    assert two_way_score(1.0, 0.0) == pytest.approx(4 * two_way_score(0.0, 1.0))
+
+
+def test_a_match_among_many_lines_counts_little_unless_it_is_close():
+    off = np.deg2rad([0.5, 0.5, 0.02, np.inf])
+    alone, crowded, close, none = credit(off, np.array([1, 10, 10, 0]))
+    assert crowded < 0.5 * alone
+    assert close > 0.9
+    assert none == pytest.approx(0.0, abs=1e-12)

@@ -5,6 +5,7 @@ from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import refine_kernels
+from roel_service.pano_loc.coverage import CROWD_REACH_RAD
 from roel_service.pano_loc.prepare import prepare_map
 from roel_service.pano_loc.refine import (
     FINAL_GATE_RAD,
@@ -53,7 +54,7 @@ def test_the_jacobian_is_the_derivative_of_the_residual(near):
 def test_rays_find_their_lines_at_the_true_pose(prepared):
     T = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
     samples = sample_arcs(seen_from(T, segments_of()), 0.05)
-    nearby = lines_nearby(T, samples, prepared, FINAL_WIDTHS_RAD[0])
+    nearby = lines_nearby(T, samples, prepared, CROWD_REACH_RAD)
     found = match(T, samples, prepared, nearby, FINAL_GATE_RAD)
     # Lines that pass so close to the viewer that they have no image are left out.
     assert (found.line >= 0).mean() > 0.95
@@ -89,8 +90,7 @@ def test_lines_nearby_are_all_that_rays_can_lie_on(prepared, slack_deg):
     T = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
     samples = sample_arcs(seen_from(T, segments_of()), 0.05)
     turned = T.retract(np.array([0.4, -0.3, 0.5, 0.0, 0.0, 0.0]) * np.deg2rad(slack_deg))
-    width_rad = FINAL_GATE_RAD / refine_kernels.CUTOFF_WIDTHS
-    nearby = lines_nearby(T, samples, prepared, width_rad, np.deg2rad(slack_deg))
+    nearby = lines_nearby(T, samples, prepared, FINAL_GATE_RAD, np.deg2rad(slack_deg))
     every = np.arange(len(prepared))
     offsets = np.arange(len(samples.normals) + 1) * len(every)
     all_lines = (offsets, np.tile(every, len(samples.normals)))

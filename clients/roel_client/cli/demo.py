@@ -1,4 +1,4 @@
-"""`roel demo`: simulate, build, compare with the truth, register, show."""
+"""`roel demo`: simulate, build, compare with the truth, register, localize, show."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import argparse
 import math
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from roel_client.cli import evaluate
 from roel_client.cli.output import print_result, progress_bar, to_json
@@ -15,6 +17,7 @@ from roel_service.config.load import load_config
 
 SEED = 7
 SECONDS = 2.5
+PANORAMA_COUNT = 3
 
 
 def add_commands(subparsers: Subparsers) -> None:
@@ -29,13 +32,20 @@ def add_commands(subparsers: Subparsers) -> None:
 
 def demo(options: argparse.Namespace, staged: Staged) -> None:
     """Run the whole chain on a simulated room."""
-    from roel_client.local import building, evaluation, recordings, registration, simulation
+    from roel_client.local import (
+        building,
+        evaluation,
+        localization,
+        recordings,
+        registration,
+        simulation,
+    )
 
     folder = staged.get("out", staged["scratch"])
     room = folder / "room"
     folder.mkdir(exist_ok=True)
     with progress_bar() as progress:
-        simulation.simulate(room, SEED, progress, seconds=SECONDS, panorama_count=0)
+        simulation.simulate(room, SEED, progress, seconds=SECONDS, panorama_count=PANORAMA_COUNT)
     recording = recordings.open_recording(
         str(room / "events.h5"), str(room / "poses.txt"), str(room / "camera.json"), None
     )
@@ -54,11 +64,26 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
         config=load_config("default").register,
         plot=folder / "registration.png",
     )
+    localized = list(
+        localization.localize_panoramas(
+            [str(folder / "map.rlm")],
+            [str(room / "panos" / f"{index:03d}.jpg") for index in range(PANORAMA_COUNT)],
+            method="default",
+            prior=None,
+            config=load_config("default").localize,
+            overlay=folder / "localization",
+        )
+    )
+    places = np.loadtxt(room / "panos" / "poses.txt", ndmin=2)[:, 1:4].tolist()
     picture = None if options.out is None else str(Path(options.out, "map.png"))
     document = {
         "report": built.report,
         "evaluation": figures,
         "registration": registered,
+        "localization": [
+            document | {"true_position": place}
+            for document, place in zip(localized, places, strict=True)
+        ],
         "picture": picture,
     }
     print_result(document, _told(document), as_json=options.json)
@@ -72,8 +97,23 @@ def _told(document: dict[str, Any]) -> str:
             f"simulated room in {report['seconds_total']:.1f} s",
             evaluate.told(document["evaluation"]),
             _told_registration(document["registration"]),
+            _told_localization(document["localization"]),
             f"picture: {picture}" if picture else "nothing is kept; --out DIR keeps it all",
         ]
+    )
+
+
+def _told_localization(documents: list[dict[str, Any]]) -> str:
+    """How many panoramas were located, and how far from the truth."""
+    located = [document for document in documents if document["T_world_panorama"] is not None]
+    shifts_mm = [
+        1e3 * math.dist([row[3] for row in document["T_world_panorama"]][:3], place)
+        for document, place in ((document, document["true_position"]) for document in located)
+    ]
+    off = f", {max(shifts_mm):.1f} mm off at the most" if shifts_mm else ""
+    return (
+        f"located {len(located)} of {len(documents)} panoramas{off}; "
+        "the recording shows a part of the room, and they were taken anywhere in it"
     )
 
 

@@ -14,13 +14,6 @@ from roel_service.pano_loc.arcs import detect_arcs
 from roel_service.pano_loc.fgpl.localize import FgplMap, localize_fgpl, prepare_fgpl
 from roel_service.pano_loc.fgpl.parameters import FgplParameters
 from roel_service.pano_loc.prepare import PreparedMap, prepare_map
-from roel_service.pano_loc.refine import (
-    FINAL_STEP_RAD,
-    FINAL_WIDTHS_RAD,
-    explained,
-    lines_nearby,
-    sample_arcs,
-)
 from roel_service.pano_loc.search import Candidates
 from roel_service.pano_loc.verdict import Found, enough_arcs, hypotheses, judge
 from roel_service.scene.lines import LineMap
@@ -63,12 +56,9 @@ def localize_judged(
     if found is None or not enough_arcs(arcs):
         return judge([], arcs, config)
     pose, judging = found.T_world_panorama, maps[found.map_index].judging
-    samples = sample_arcs(arcs, FINAL_STEP_RAD)
-    nearby = lines_nearby(pose, samples, judging, FINAL_WIDTHS_RAD[0])
-    explained_2d = explained(pose, samples, judging, nearby)
     candidate = Candidates(
         poses=SE3(rotation=pose.rotation[None], translation=pose.translation[None]),
-        score=np.array([explained_2d]),
+        score=np.zeros(1),
     )
     poses = hypotheses(candidate, arcs, judging, found.map_index)
     return judge([Found(hypotheses=poses, rotation_count=24, candidate_count=1)], arcs, config)
