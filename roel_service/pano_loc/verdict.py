@@ -48,6 +48,8 @@ POINT_SPACING_M = 0.1
 # The best of many poses stands out by chance the farther, the fewer the arcs: a share of their scores
 # varies with the root of their number.
 CHANCE = 0.5
+# With less beyond that a pose is told, but not as `FOUND`.
+CERTAINTY = 0.06
 # A pose that stands out needs less of a score: where walls hide most of a map, scores are low.
 MARGIN_WEIGHT = 0.2
 # What nothing holds gets a variance of 1, rad^2 or m^2.
@@ -147,7 +149,7 @@ def _reason(
         return NoPoseReason.NOT_IN_MAP
     if sigma > MAX_SIGMA_RAD or sigma_m > MAX_SIGMA_M:
         return NoPoseReason.DEGENERATE
-    if margin < config.min_margin:
+    if margin < config.min_margin or evidence < min_evidence + CERTAINTY:
         return NoPoseReason.AMBIGUOUS
     return None
 
