@@ -194,7 +194,7 @@ PROTOCOLS = (
             name=f"width_{width}",
             kinds=(ROOM,),
             methods=("default",),
-            max_count=FEW,
+            max_count=SOME,
             change=resized(width),
         )
         for width in WIDTHS_PX
@@ -204,7 +204,7 @@ PROTOCOLS = (
             name=f"quality_{quality}",
             kinds=(ROOM,),
             methods=("default",),
-            max_count=FEW,
+            max_count=SOME,
             change=compressed(quality),
         )
         for quality in QUALITIES

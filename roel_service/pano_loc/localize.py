@@ -12,7 +12,7 @@ from roel_service.pano_loc.hints import MAX_MAP_COUNT, Gravity, PosePrior
 from roel_service.pano_loc.orientation import rotation_hypotheses
 from roel_service.pano_loc.photograph import arcs_of_photograph
 from roel_service.pano_loc.prepare import PreparedMap
-from roel_service.pano_loc.refine import FINALIST_COUNT, PRIOR_FINALIST_COUNT, refine_poses
+from roel_service.pano_loc.refine import refine_poses
 from roel_service.pano_loc.search import coarse_candidates
 from roel_service.pano_loc.verdict import Found, enough_arcs, enough_lines, hypotheses, judge
 from roel_service.scene.camera import Camera
@@ -100,8 +100,7 @@ def _searched(
     if len(rotations) == 0:
         return Found(hypotheses=(), rotation_count=0, candidate_count=0)
     candidates = coarse_candidates(arcs, prepared, rotations, config, prior)
-    finalist_count = FINALIST_COUNT if prior is None else PRIOR_FINALIST_COUNT
-    refined = refine_poses(candidates, arcs, prepared, finalist_count)
+    refined = refine_poses(candidates, arcs, prepared, has_prior=prior is not None)
     if prior is not None:
         refined = refined.take(prior.holds(refined.poses))
     return Found(

@@ -34,16 +34,18 @@ FINAL_WIDTHS_RAD = np.deg2rad([0.7] + [0.5] * 7)
 # Steps smaller than this, rad and m, are the last one.
 CONVERGED = 1e-4
 # The same for more of the modes, on fewer arcs.
-MODE_COUNT, MODE_WIDTHS_RAD = 16, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
+MODE_COUNT, MODE_WIDTHS_RAD = 24, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
 MODE_ARC_COUNT, MODE_LINE_COUNT, MODE_STEP_RAD = 200, 600, np.deg2rad(6.0)
 # So many of them are made exact, told apart by points of about so many lines of all lengths.
 FINALIST_COUNT, WEIGHED_LINE_COUNT, WEIGHED_SPACING_M = 6, 800, 0.3
 # Within reach of a prior few poses are apart from one another.
-PRIOR_FINALIST_COUNT = 3
+PRIOR_MODE_COUNT, PRIOR_FINALIST_COUNT = 8, 3
 # Lines near an arc are looked for once for each pose: while it is refined they move by less.
 FINAL_SLACK_RAD, MODE_SLACK_RAD = np.deg2rad(3.0), np.deg2rad(5.0)
 # Poses closer than this in both are one.
 SAME_POSE_M, SAME_POSE_RAD = 0.25, np.deg2rad(8.0)
+# Before they are refined, poses that are a little apart may end apart.
+UNREFINED_SHARE = 0.5
 
 
 # Offsets (A + 1,) and indices of the lines near each arc.
@@ -92,12 +94,16 @@ def refine_poses(
     candidates: Candidates,
     arcs: PanoramaArcs,
     prepared: PreparedMap,
-    finalist_count: int = FINALIST_COUNT,
+    *,
+    has_prior: bool = False,
 ) -> Candidates:
     """Modes of the best fit, best first; each scored by the share of the arcs that it explains."""
+    mode_count, finalist_count = MODE_COUNT, FINALIST_COUNT
+    if has_prior:
+        mode_count, finalist_count = PRIOR_MODE_COUNT, PRIOR_FINALIST_COUNT
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
     modes = _refined(
-        distinct(candidates, MODE_COUNT),
+        distinct(candidates, mode_count, UNREFINED_SHARE),
         few,
         prepared,
         MODE_WIDTHS_RAD,
@@ -127,8 +133,12 @@ def _weighed(modes: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Ca
         )
 
 
-def distinct(candidates: Candidates, max_count: int) -> Candidates:
-    """The best candidates, each the only one of its neighbourhood, best first."""
+def distinct(candidates: Candidates, max_count: int, share: float = 1.0) -> Candidates:
+    """The best candidates, each the only one of its neighbourhood, best first.
+
+    Args:
+        share: of the distances at which poses are one.
+    """
     candidates = candidates.ranked()
     poses = candidates.poses
     kept: list[int] = []
@@ -137,7 +147,7 @@ def distinct(candidates: Candidates, max_count: int) -> Candidates:
             break
         shift_m = np.linalg.norm(poses.translation[kept] - poses.translation[index], axis=1)
         turn_rad = rotation_angle(poses.rotation[kept] @ poses.rotation[index].T)
-        if not ((shift_m < SAME_POSE_M) & (turn_rad < SAME_POSE_RAD)).any():
+        if not ((shift_m < share * SAME_POSE_M) & (turn_rad < share * SAME_POSE_RAD)).any():
             kept.append(index)
     return candidates.take(np.array(kept, dtype=np.int64))
 

@@ -26,7 +26,7 @@ DIRECTION_SLACK_RAD = np.deg2rad(1.0)
 # Places of which all lines are compared at once.
 CHUNK_PLACE_COUNT = 256
 # Where lines crowd, arcs lie on some of them by chance: of what takes up the same steps of so many
-# bearings, the widest line alone counts at first.
+# bearings, the widest line alone counts by likelihood.
 CLAIM_BEARING_COUNT = 2
 # At this distance a picture is painted wide enough for a quarter of a cell of places.
 SLACK_DISTANCE_M = 1.0
@@ -53,16 +53,18 @@ class Views:
 
     Attributes:
         slots: (T, M) int32 class and bearing.
-        words: (T, M) uint64 elevations.
+        words, fronts: (T, M) uint64 elevations; those that wider lines do not take up, too.
         kinds: (T, M) uint8 class and distance.
-        sizes: (T, N) steps that lines of each kind take up.
+        sizes, front_sizes: (T, N) steps that lines of each kind take up.
         bearing_count: of each class.
     """
 
     slots: Array
     words: Array
+    fronts: Array
     kinds: Array
     sizes: FloatArray
+    front_sizes: FloatArray
     bearing_count: int
 
 
@@ -141,12 +143,22 @@ def _views_of(
     claim_bearing_count: int,
 ) -> Views:
     """What (T, M) chosen lines look like from (T, K, 3) places."""
-    slots, words, kinds = views_kernels.views(
+    slots, words, fronts, kinds = views_kernels.views(
         lines.feet, lines.which, inside, chosen, bearing_count, claim_bearing_count, SHELL_ENDS_M
     )
     everything = np.full(len(lines.frames) * bearing_count, ~np.uint64(0))
-    sizes = _sizes(slots, words, kinds, everything, len(lines.frames))
-    return Views(slots=slots, words=words, kinds=kinds, sizes=sizes, bearing_count=bearing_count)
+    sizes, front_sizes = (
+        _sizes(slots, steps, kinds, everything, len(lines.frames)) for steps in (words, fronts)
+    )
+    return Views(
+        slots=slots,
+        words=words,
+        fronts=fronts,
+        kinds=kinds,
+        sizes=sizes,
+        front_sizes=front_sizes,
+        bearing_count=bearing_count,
+    )
 
 
 def _sizes(slots: Array, words: Array, kinds: Array, shown: Array, class_count: int) -> FloatArray:
@@ -220,18 +232,29 @@ def agreement(views: Views, panes: Sequence[Pane], chosen: IntArray | None = Non
     )
     words = np.stack([pane.words.ravel() for pane in panes])
     total = views_kernels.painted_steps(
-        views.slots, views.words, views.kinds, words, gain - loss, np.ascontiguousarray(chosen)
+        views.slots,
+        views.words,
+        views.fronts,
+        views.kinds,
+        words,
+        gain - loss,
+        np.ascontiguousarray(chosen),
     )
-    sizes = [_sizes_in(views, pane)[places] for pane, places in zip(panes, chosen, strict=True)]
+    every = [_sizes_in(views, pane) for pane in panes]
+    sizes = [size[places] for (size, _), places in zip(every, chosen, strict=True)]
+    fronts = [size[places] for (_, size), places in zip(every, chosen, strict=True)]
     expected = np.stack([size @ column for size, column in zip(sizes, share, strict=True)])
-    missed = np.stack([size @ column for size, column in zip(sizes, loss, strict=True)])
+    missed = np.stack([size @ column for size, column in zip(fronts, loss, strict=True)])
     size = np.maximum(np.stack([size.sum(axis=1) for size in sizes]), 1.0)
     return np.stack([(total[:, :, 0] - expected) / np.sqrt(size), total[:, :, 1] + missed], axis=2)
 
 
-def _sizes_in(views: Views, pane: Pane) -> FloatArray:
-    """(T, N) sizes of the parts of lines that a picture shows."""
+def _sizes_in(views: Views, pane: Pane) -> tuple[FloatArray, FloatArray]:
+    """(T, N) sizes of the parts of lines that a picture shows; all, and those in front."""
     if pane.shown is None:
-        return views.sizes
-    shown = pane.shown.ravel()
-    return _sizes(views.slots, views.words, views.kinds, shown, len(pane.words))
+        return views.sizes, views.front_sizes
+    shown, class_count = pane.shown.ravel(), len(pane.words)
+    return (
+        _sizes(views.slots, views.words, views.kinds, shown, class_count),
+        _sizes(views.slots, views.fronts, views.kinds, shown, class_count),
+    )

@@ -92,7 +92,7 @@ def views(
     bearing_count: int,
     claim_bearing_count: int,
     shell_ends_m: FloatArray,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Lines as seen from places.
 
     Args:
@@ -103,15 +103,16 @@ def views(
         chosen: (T, M) lines that are looked at from each place.
         bearing_count: B.
         claim_bearing_count: of what takes up the same steps of so many bearings, the first line
-            alone counts; 0 if each counts.
+            alone is in front.
         shell_ends_m: (S - 1,) distances that part the shells.
 
     Returns:
-        (T, M) int32 slots: class and bearing as class B + bearing; (T, M) uint64 elevations; and
-        (T, M) uint8 kinds: class and shell of the nearest point as class S + shell.
+        (T, M) int32 slots: class and bearing as class B + bearing; (T, M) uint64 elevations, twice:
+        all, and those in front; and (T, M) uint8 kinds: class and shell of the nearest point as
+        class S + shell.
     """
     slots = np.empty(chosen.shape, np.int32)
-    words = np.empty(chosen.shape, np.uint64)
+    words, fronts = np.empty(chosen.shape, np.uint64), np.empty(chosen.shape, np.uint64)
     kinds = np.empty(chosen.shape, np.uint8)
     per_rad, shell_count = bearing_count / (2.0 * np.pi), len(shell_ends_m) + 1
     claimed = np.zeros(places.shape[1] * bearing_count, np.uint64)
@@ -125,19 +126,19 @@ def views(
             away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
             bearing = min(int(_bearing(across, aside) * per_rad), bearing_count - 1)
             slots[t, m] = k * bearing_count + bearing
-            steps = _word(_arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD)
-            words[t, m] = steps
-            if claim_bearing_count > 0:
-                claim = k * bearing_count + bearing - bearing % claim_bearing_count
-                words[t, m] &= ~claimed[claim]
-                claimed[claim] |= steps
+            words[t, m] = _word(
+                _arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD
+            )
+            claim = k * bearing_count + bearing - bearing % claim_bearing_count
+            fronts[t, m] = words[t, m] & ~claimed[claim]
+            claimed[claim] |= words[t, m]
             ahead = max(0.0, low, -high)
             distance_m = np.sqrt(away * away + ahead * ahead)
             shell = 0
             while shell < shell_count - 1 and distance_m > shell_ends_m[shell]:
                 shell += 1
             kinds[t, m] = k * shell_count + shell
-    return slots, words, kinds
+    return slots, words, fronts, kinds
 
 
 @numba.njit(cache=True, nogil=True)
@@ -242,12 +243,18 @@ def painted_share(pane: Array, shown: Array) -> FloatArray:
 
 @numba.njit(cache=True, nogil=True)
 def painted_steps(
-    slots: Array, words: Array, kinds: Array, panes: Array, gains: FloatArray, chosen: IntArray
+    slots: Array,
+    words: Array,
+    fronts: Array,
+    kinds: Array,
+    panes: Array,
+    gains: FloatArray,
+    chosen: IntArray,
 ) -> FloatArray:
-    """(R, C, 2) steps of lines that are painted, and what they gain.
+    """(R, C, 2) steps of lines that are painted, and what those in front gain.
 
     Args:
-        slots, words, kinds: (T, M) of `views`.
+        slots, words, fronts, kinds: (T, M) of `views`.
         panes: (R, K B).
         gains: (R, N) of a step of each kind.
         chosen: (R, C) places that are asked for in each orientation.
@@ -260,8 +267,8 @@ def painted_steps(
             for j in range(slots.shape[1]):
                 both = words[t, j] & panes[r, slots[t, j]]
                 if both != 0:
-                    painted = np.float64(_count(both))
-                    steps += painted
-                    gained += gains[r, kinds[t, j]] * painted
+                    steps += np.float64(_count(both))
+                    ahead = np.float64(_count(both & fronts[t, j]))
+                    gained += gains[r, kinds[t, j]] * ahead
             total[r, c, 0], total[r, c, 1] = steps, gained
     return total

@@ -59,8 +59,8 @@ def test_the_fast_angles_are_angles(lines):
     feet = rng.normal(size=(500, 4))
     feet[:, 3] = feet[:, 2] + np.abs(feet[:, 3])
     which = np.zeros(500, np.int64)
-    slots, _, _ = views_kernels.views(
-        feet, which, np.zeros((1, 1, 3)), np.arange(500)[None], 10**6, 0, np.array([1.0])
+    slots, *_ = views_kernels.views(
+        feet, which, np.zeros((1, 1, 3)), np.arange(500)[None], 10**6, 1, np.array([1.0])
     )
     expected = np.arctan2(feet[:, 1], feet[:, 0]) % (2 * np.pi)
     np.testing.assert_allclose((slots[0] + 0.5) * (2 * np.pi / 10**6), expected, atol=3e-5)
