@@ -7,8 +7,6 @@ import math
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from roel_client.cli import evaluate
 from roel_client.cli.output import print_result, progress_bar, to_json
 from roel_client.cli.parser import Command, Subparsers, command
@@ -74,7 +72,7 @@ def demo(options: argparse.Namespace, staged: Staged) -> None:
             overlay=folder / "localization",
         )
     )
-    places = np.loadtxt(room / "panos" / "poses.txt", ndmin=2)[:, 1:4].tolist()
+    places = _places(room / "panos" / "poses.txt")
     picture = None if options.out is None else str(Path(options.out, "map.png"))
     document = {
         "report": built.report,
@@ -101,6 +99,12 @@ def _told(document: dict[str, Any]) -> str:
             f"picture: {picture}" if picture else "nothing is kept; --out DIR keeps it all",
         ]
     )
+
+
+def _places(poses: Path) -> list[list[float]]:
+    """Where the room's panoramas were taken, m."""
+    lines = poses.read_text(encoding="utf-8").splitlines()
+    return [[float(word) for word in line.split()[1:4]] for line in lines if line[0] != "#"]
 
 
 def _told_localization(documents: list[dict[str, Any]]) -> str:
