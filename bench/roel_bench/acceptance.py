@@ -11,7 +11,7 @@ from roel_bench.methods import PEERS
 from roel_bench.results import NO_DISTURBANCE, Row
 from roel_bench.suites import MAP
 from roel_bench.tables import MISSING
-from roel_bench.variants import DEFAULT_ABLATION, REFINED_POSES, ablation_base
+from roel_bench.variants import DEFAULT_ABLATION, REFINED_POSES
 
 LARGE, SMALL = "640x480", "346x260"
 # LIMAP that finds its lines in event images, and LIMAP with this project's front end.
@@ -139,9 +139,7 @@ def _processor_ms_per_frame(maps: Maps) -> float | None:
 
 def _paying_ablations(maps: Maps) -> float | None:
     """Share of the default's parts without which the mean IoU at 20 mm is lower."""
-    ratios = [
-        maps.ratio("iou_20", variant.name, ablation_base(variant)) for variant in DEFAULT_ABLATION
-    ]
+    ratios = [maps.ratio("iou_20", variant.name, "default") for variant in DEFAULT_ABLATION]
     return _mean([None if ratio is None else float(ratio < 1) for ratio in ratios])
 
 

@@ -125,8 +125,7 @@ def default_config() -> Config:
             trim,
             max_gap_m=UNITS_PER_M * trim.max_gap_m,
             min_length_m=UNITS_PER_M * trim.min_length_m,
-            max_sigma_m=UNITS_PER_M * trim.max_sigma_m,
-            overlap_distance_m=UNITS_PER_M * trim.overlap_distance_m,
+            max_error_m=UNITS_PER_M * trim.max_error_m,
         ),
     )
 

@@ -260,14 +260,14 @@ def _ablation(report: _Report) -> str:
     for variant in variants.DEFAULT_ABLATION:
         if variant.name in rows:
             without = [row for scene, row in rows[variant.name].items() if scene in scenes]
-            base = report.maps.rows(variants.ablation_base(variant))
+            base = report.maps.rows("default")
             lost = _lost_percent(without, [row for scene, row in base.items() if scene in scenes])
             lines.append([*_map_line(variant.name, without), number(lost, 1)])
     text = (
-        "One part of the default switched off at a time, mean over rooms. Corners come last and"
-        " mend some of what is lost without another part, so the parts are switched off in the"
-        " default without corners. The last column is what the part is worth: the share of the IoU"
-        " at 20 mm that is lost without it."
+        "One part of the default switched off at a time, mean over rooms. The last column is what the"
+        " part is worth: the share of the IoU at 20 mm that is lost without it. Of the same on six"
+        " tuning rooms, by which parts are kept or go, tells"
+        " [parts that guard](decisions/parts-that-guard.md)."
     )
     headings = ["variant", *MAP_HEADINGS, "IoU 20 lost, %"]
     default = [*_default_line(report, "default", scenes), MISSING]

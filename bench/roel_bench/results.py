@@ -15,7 +15,7 @@ from typing import Any
 
 from roel_service import __version__
 from roel_service.config.load import to_tables
-from roel_service.config.stages import AFTER_MAPPING, Config
+from roel_service.config.stages import AFTER_MAPPING, UNLIMITED, Config
 from roel_service.errors import InputError
 from roel_service.io.files import read_input, whole_file
 
@@ -160,6 +160,8 @@ def config_digest(config: Config) -> str:
         del tables["trim"]["max_foreshortening"]
     is_on = {"pose_": config.refine.free_poses, "corner_": config.refine.corner_sigma_m > 0}
     off = tuple(prefix for prefix in is_on if not is_on[prefix])
+    if config.trim.max_error_m == UNLIMITED:
+        del tables["trim"]["max_error_m"]
     refine = tables["refine"]
     tables["refine"] = {key: refine[key] for key in refine if not key.startswith(off)}
     return digest_of(json.dumps(tables, sort_keys=True))

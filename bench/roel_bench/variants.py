@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from roel_service.config.load import Tables, with_tables
-from roel_service.config.presets import PRESETS, UNLIMITED, preset
-from roel_service.config.stages import CURVE_METHODS, Config
+from roel_service.config.presets import PRESETS, preset
+from roel_service.config.stages import CURVE_METHODS, UNLIMITED, Config
 from roel_service.errors import ConfigError
 
 
@@ -36,12 +36,6 @@ def _without(what: str, **changes: dict[str, Any]) -> Variant:
     return Variant(name=f"default without {what}", changes=changes)
 
 
-def _without_corners_and(what: str, **changes: dict[str, Any]) -> Variant:
-    """The default without corners, and with one thing more switched off."""
-    refine = changes.get("refine", {}) | NO_CORNERS
-    return Variant(name=f"default without corners and {what}", changes=changes | {"refine": refine})
-
-
 def _refined(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The same for every refinement: between the rounds, and the last one."""
     return {"refine_rounds": changes, "refine": changes}
@@ -59,25 +53,22 @@ REFINED_POSES = Variant(name="default with refined poses", changes={"refine": {"
 
 NO_PLANES = {"method": "none"}
 NO_STEPS = {"iteration_count": 0}
-NO_CORNERS = {"corner_sigma_m": 0.0}
 NO_MERGING = {"merge_distance_px": 0.0}
 NO_PLANE_FIT = _without("plane fit", plane_fit=NO_PLANES)
-WITHOUT_CORNERS = _without("corners", refine=NO_CORNERS)
 
-# One stage or rule of the default switched off at a time. Corners come last, and mend some of what
-# is lost without another part: the parts are judged without them.
+# One stage or rule of the default switched off at a time.
 DEFAULT_ABLATION = (
-    WITHOUT_CORNERS,
-    _without_corners_and(
+    _without("corners", refine={"corner_sigma_m": 0.0}),
+    _without(
         "rotation compensation",
         frames={"compensate_rotation": False},
         match_global={"max_speed_difference_px_per_ms": UNLIMITED},
     ),
-    _without_corners_and("second window", detect={"window_events_per_pixel": [0.2]}),
-    _without_corners_and("smoothing", detect={"blur_px": 0.0}),
-    _without_corners_and("merging of seeds", detect=NO_MERGING),
-    _without_corners_and("plane fit", plane_fit=NO_PLANES),
-    _without_corners_and(
+    _without("second window", detect={"window_events_per_pixel": [0.2]}),
+    _without("smoothing", detect={"blur_px": 0.0}),
+    _without("merging of seeds", detect=NO_MERGING),
+    NO_PLANE_FIT,
+    _without(
         "speed vote (RANSAC planes)",
         plane_fit={
             "method": "ransac",
@@ -85,38 +76,26 @@ DEFAULT_ABLATION = (
             "inlier_distance_px": 2.0,
         },
     ),
-    _without_corners_and("density test", plane_fit={"min_density_ratio": 0.0}),
-    _without_corners_and("occupancy test", plane_fit={"min_occupancy": 0.0}),
-    _without_corners_and("prediction of matches", match_local={"predict": False}),
-    _without_corners_and("reach beyond gaps", match_local={"reach_frame_count": 1}),
-    _without_corners_and("re-association", match_global={"method": "none"}),
-    _without_corners_and(
+    _without("density test", plane_fit={"min_density_ratio": 0.0}),
+    _without("occupancy test", plane_fit={"min_occupancy": 0.0}),
+    _without("prediction of matches", match_local={"predict": False}),
+    _without("re-association", match_global={"method": "none"}),
+    _without(
         "re-association (sampled matching)",
         match_global={"method": "sampled", "max_distances_px": [1.5]},
     ),
-    _without_corners_and("rounds of re-association", match_global={"max_distances_px": [1.5]}),
-    _without_corners_and("speed gate", match_global={"max_speed_difference_px_per_ms": UNLIMITED}),
-    _without_corners_and("one side of edges", match_global={"one_side": False}),
-    _without_corners_and("sharing rule", match_global={"max_shared_fraction": 1.0}),
-    _without_corners_and("event term", **_refined({"event_weight": 0.0})),
-    _without_corners_and("all but 50 events a line", refine={"event_count_per_line": 50}),
-    _without_corners_and("robust loss", **_refined({"loss": "squared"})),
-    _without_corners_and("shared directions", **_refined({"direction_sigma_deg": 0.0})),
-    _without_corners_and("refinement", **_refined(NO_STEPS)),
-    _without_corners_and("coverage runs (clustered ends)", trim={"method": "cluster"}),
-    _without_corners_and("end-on views left out", trim={"max_foreshortening": UNLIMITED}),
-    _without_corners_and("uncertainty filter", trim={"max_sigma_m": UNLIMITED}),
-    _without_corners_and("rms filter", trim={"max_rms_px": UNLIMITED}),
-    _without_corners_and("support filter", trim={"min_support_ratio": 0.0}),
-    _without_corners_and("frame count filter", trim={"min_frame_count": 1}),
-    _without_corners_and("overlap removal", trim={"overlap_distance_m": 0.0}),
+    _without("rounds of re-association", match_global={"max_distances_px": [1.5]}),
+    _without("speed gate", match_global={"max_speed_difference_px_per_ms": UNLIMITED}),
+    _without("one side of edges", match_global={"one_side": False}),
+    _without("sharing rule", match_global={"max_shared_fraction": 1.0}),
+    _without("event term", **_refined({"event_weight": 0.0})),
+    _without("robust loss", **_refined({"loss": "squared"})),
+    _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
+    _without("refinement", **_refined(NO_STEPS)),
+    _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
+    _without("end-on views left out", trim={"max_foreshortening": UNLIMITED}),
+    _without("filter by the expected error", trim={"max_error_m": UNLIMITED}),
 )
-
-
-def ablation_base(variant: Variant) -> str:
-    """The variant that has one part more than this one of `DEFAULT_ABLATION`."""
-    return "default" if variant is WITHOUT_CORNERS else WITHOUT_CORNERS.name
-
 
 # Curved edges, which the default leaves to its lines.
 CURVE_VARIANTS = tuple(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from roel_service.config.stages import (
+    UNLIMITED,
     Config,
     DetectConfig,
     FramesConfig,
@@ -15,9 +16,6 @@ from roel_service.config.stages import (
     TrimConfig,
 )
 from roel_service.errors import ConfigError
-
-# The paper has no such gate.
-UNLIMITED = 1e6
 
 # Published values and choices; what the paper leaves open is marked in docs/paper_map.md.
 PAPER = Config(
@@ -36,9 +34,7 @@ PAPER = Config(
         support_event_count=100,
         support_half_window_us=25_000,
     ),
-    match_local=MatchLocalConfig(
-        predict=False, max_distance_px=10.0, min_overlap=0.0, reach_frame_count=1
-    ),
+    match_local=MatchLocalConfig(predict=False, max_distance_px=10.0, min_overlap=0.0),
     match_global=MatchGlobalConfig(method="sampled", max_distances_px=(5.0,)),
     triangulate=TriangulateConfig(gate="grassmann", min_inlier_count=10, merge=True),
     refine=RefineConfig(
@@ -55,20 +51,12 @@ PAPER = Config(
     ),
     # What triangulation takes from here; the rest of its cost is its own.
     refine_rounds=RefineRoundsConfig(loss_scale_px=0.7, max_residual_px=20.0, min_inlier_count=10),
-    trim=TrimConfig(
-        method="cluster",
-        max_sigma_m=UNLIMITED,
-        max_rms_px=UNLIMITED,
-        min_support_ratio=0.0,
-        min_frame_count=1,
-        overlap_distance_m=0.0,
-    ),
+    # The paper has no such limit.
+    trim=TrimConfig(method="cluster", max_error_m=UNLIMITED),
 )
 
 # Lines that the map can vouch for: what is left out is mostly right, but not surely.
-PRECISE = Config(
-    trim=TrimConfig(max_sigma_m=0.025, max_rms_px=0.45, min_support_ratio=0.5, min_frame_count=12)
-)
+PRECISE = Config(trim=TrimConfig(max_error_m=0.006))
 
 PRESETS = {"default": Config(), "precise": PRECISE, "paper": PAPER}
 

@@ -23,6 +23,9 @@ REFINE_LOSSES = ("cauchy", "squared", "quartic")
 TRIM_METHODS = ("coverage", "cluster")
 CURVE_METHODS = ("none", "polyline", "bezier")
 
+# A limit that nothing reaches.
+UNLIMITED = 1e6
+
 
 @dataclass(frozen=True)
 class Rule:
@@ -208,7 +211,7 @@ class MatchLocalConfig(Stage, table="match_local"):
     predict: bool = True
     max_distance_px: float = parameter(2.5, POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
-    reach_frame_count: int = parameter(3, POSITIVE)
+    reach_frame_count: int = parameter(1, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,7 +250,7 @@ class MatchGlobalConfig(Stage, table="match_global"):
     max_distances_px: tuple[float, ...] = parameter((1.5, 1.1, 1.1), SOME_POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
-    max_shared_fraction: float = parameter(0.9, SHARE)
+    max_shared_fraction: float = parameter(0.97, SHARE)
     one_side: bool = True
 
     @property
@@ -409,11 +412,14 @@ class TrimConfig(Stage, table="trim"):
         max_foreshortening: views in which a line looks this many times shorter than it is, nearly
             end on, do not count (`coverage`).
         end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
-        max_sigma_m: largest standard deviation of an end across the line.
+        max_error_m: largest error to expect of an end across the line: its standard deviation for
+            the line's own residual, over the support ratio.
+        max_sigma_m: largest standard deviation of an end across the line, for 1 px of noise.
         max_rms_px: largest residual of a line.
         min_support_ratio: frames that saw the line against frames that could have.
         min_frame_count: frames that saw the line.
-        overlap_distance_m, overlap_angle_deg: parts this close to a stronger line are cut away.
+        overlap_distance_m, overlap_angle_deg: parts this close to a stronger line are cut away; a
+            distance of 0 leaves them.
     """
 
     method: str = parameter("coverage", one_of(TRIM_METHODS))
@@ -424,11 +430,12 @@ class TrimConfig(Stage, table="trim"):
     min_coverage_fraction: float = parameter(0.25, SHARE)
     max_foreshortening: float = parameter(5.0, Rule(">= 1", lambda value: value >= 1))
     end_cluster_px: float = parameter(5.0, POSITIVE)
-    max_sigma_m: float = parameter(0.1, POSITIVE)
-    max_rms_px: float = parameter(0.65, POSITIVE)
-    min_support_ratio: float = parameter(0.3, SHARE)
-    min_frame_count: int = parameter(8, POSITIVE)
-    overlap_distance_m: float = parameter(0.012, NOT_NEGATIVE)
+    max_error_m: float = parameter(0.04, POSITIVE)
+    max_sigma_m: float = parameter(UNLIMITED, POSITIVE)
+    max_rms_px: float = parameter(UNLIMITED, POSITIVE)
+    min_support_ratio: float = parameter(0.0, SHARE)
+    min_frame_count: int = parameter(1, POSITIVE)
+    overlap_distance_m: float = parameter(0.0, NOT_NEGATIVE)
     overlap_angle_deg: float = parameter(4.0, NOT_NEGATIVE)
 
 

@@ -80,9 +80,13 @@ def trim_to_segments(
     pieces = _pieces(refined, views, frames, config)
     dropped = [TrackStatus.TOO_SHORT] * (len(refined) - len(np.unique(pieces.line)))
     sigma_m = _sigma_m(refined, pieces)
+    support = _support_ratio(refined, pieces, frames)
+    certain = (sigma_m <= config.max_sigma_m) & (
+        _expected_error_m(sigma_m, refined.rms_px[pieces.line], support) <= config.max_error_m
+    )
     checks = (
-        (TrackStatus.UNCERTAIN, sigma_m <= config.max_sigma_m),
-        *_support_checks(refined, pieces, frames, config),
+        (TrackStatus.UNCERTAIN, certain),
+        *_support_checks(refined, pieces, support, config),
     )
     good = np.ones(len(pieces.line), dtype=bool)
     for status, passes in checks:
@@ -96,8 +100,9 @@ def supported_pieces(
 ) -> SupportedPieces:
     """The pieces that would enter the map if they were certain enough."""
     pieces = _pieces(refined, views, frames, config)
+    support = _support_ratio(refined, pieces, frames)
     good = np.ones(len(pieces.line), dtype=bool)
-    for _, passes in _support_checks(refined, pieces, frames, config):
+    for _, passes in _support_checks(refined, pieces, support, config):
         good &= passes
     return SupportedPieces(
         line=pieces.line[good],
@@ -113,11 +118,25 @@ def _pieces(refined: Refined, views: Views, frames: Frames, config: TrimConfig) 
     return _covered(refined, cuts, views, frames, config)
 
 
+def _support_ratio(refined: Refined, pieces: _Segments, frames: Frames) -> FloatArray:
+    """(n,) frames that saw a piece against frames that could have."""
+    return pieces.frame_count / np.maximum(_frames_in_view(refined, pieces, frames), 1)
+
+
+def _expected_error_m(sigma_m: FloatArray, rms_px: FloatArray, support: FloatArray) -> FloatArray:
+    """(n,) how far off the worse end of a piece is thought to be.
+
+    The spread is that of the line's own noise. Its observations agree with one another all the same
+    where they are not of one edge, or of none: what few of the frames saw that could have is
+    trusted the less.
+    """
+    return sigma_m * rms_px / support
+
+
 def _support_checks(
-    refined: Refined, pieces: _Segments, frames: Frames, config: TrimConfig
+    refined: Refined, pieces: _Segments, support: FloatArray, config: TrimConfig
 ) -> tuple[tuple[TrackStatus, BoolArray], ...]:
     """(n,) which pieces the observations bear out, by what they are called that fail."""
-    support = pieces.frame_count / np.maximum(_frames_in_view(refined, pieces, frames), 1)
     return (
         (TrackStatus.POOR_FIT, refined.rms_px[pieces.line] <= config.max_rms_px),
         (TrackStatus.TOO_FEW_VIEWS, pieces.frame_count >= config.min_frame_count),

@@ -103,7 +103,7 @@ def test_the_page_has_the_rows_in_the_papers_order():
 
 def test_the_default_meets_the_cube_in_its_own_unit():
     cube, room = default_config().trim, preset("default").trim
-    for name in ("max_gap_m", "min_length_m", "max_sigma_m", "overlap_distance_m"):
+    for name in ("max_gap_m", "min_length_m", "max_error_m"):
         assert getattr(cube, name) == pytest.approx(10.0 * getattr(room, name))
     # Smoothing leaves about a third of the .33 units of each pose.
     assert default_config().refine.pose_drift_m == pytest.approx(0.33 / 3, rel=0.2)

@@ -175,10 +175,7 @@ class TestPresets:
     def test_the_precise_preset_only_keeps_fewer_lines(self):
         precise, default = preset("precise"), Config()
         assert dataclasses.replace(precise, trim=default.trim) == default
-        assert precise.trim.max_sigma_m < default.trim.max_sigma_m
-        assert precise.trim.max_rms_px < default.trim.max_rms_px
-        assert precise.trim.min_support_ratio > default.trim.min_support_ratio
-        assert precise.trim.min_frame_count > default.trim.min_frame_count
+        assert precise.trim.max_error_m < default.trim.max_error_m
 
     def test_the_paper_preset_holds_the_published_values(self):
         paper = preset("paper")

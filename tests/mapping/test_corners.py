@@ -20,7 +20,7 @@ CONFIG = Config(
     refine=RefineConfig(
         loss_scale_px=0.7, direction_sigma_deg=0.0, max_residual_px=20.0, corner_depth_m=0.1
     ),
-    trim=TrimConfig(min_frame_count=1, min_coverage_count=1, min_support_ratio=0.0),
+    trim=TrimConfig(min_coverage_count=1),
 )
 FEW_FRAMES = 5
 

@@ -26,7 +26,7 @@ FRAMES = FramesConfig(rate_hz=15.0)
 DEFAULT = Config(
     frames=FRAMES,
     plane_fit=PlaneFitConfig(extension_px=6.0, max_gap_bin_count=1),
-    trim=TrimConfig(max_sigma_m=0.4),
+    trim=TrimConfig(max_error_m=0.2),
 )
 PAPER = dataclasses.replace(
     preset("paper"),

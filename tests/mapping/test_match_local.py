@@ -11,7 +11,8 @@ from roel_service.mapping.match_local_kernels import facing_share
 from .synthetic import observed, still_frames, world
 
 DEFAULT = MatchLocalConfig()
-PAPER = MatchLocalConfig(predict=False, max_distance_px=10.0, min_overlap=0.0, reach_frame_count=1)
+FAR = MatchLocalConfig(reach_frame_count=3)
+PAPER = MatchLocalConfig(predict=False, max_distance_px=10.0, min_overlap=0.0)
 
 
 def tracks_of(rows, config=DEFAULT, frames=None):
@@ -118,17 +119,16 @@ class TestGates:
 
 class TestReach:
     def test_a_track_reaches_back_over_missing_frames(self):
-        assert tracks_of([(0, LINE), (3, LINE)]) == [[0, 1]]
-        assert tracks_of([(0, LINE), (4, LINE)]) == [[0], [1]]
+        assert tracks_of([(0, LINE), (3, LINE)], FAR) == [[0, 1]]
+        assert tracks_of([(0, LINE), (4, LINE)], FAR) == [[0], [1]]
 
     def test_with_a_reach_of_one_frame_a_gap_ends_the_track(self):
-        config = dataclasses.replace(DEFAULT, reach_frame_count=1)
-        assert tracks_of([(0, LINE), (1, LINE), (3, LINE)], config) == [[0, 1], [2]]
+        assert tracks_of([(0, LINE), (1, LINE), (3, LINE)]) == [[0, 1], [2]]
 
     def test_a_continued_track_has_one_open_end(self):
         # The line jumps; what comes back must not join the end that was continued already.
         rows = [(0, LINE), (1, LINE + 2 * UP), (2, LINE + 4 * UP), (2, LINE)]
-        assert tracks_of(rows) == [[0, 1, 2], [3]]
+        assert tracks_of(rows, FAR) == [[0, 1, 2], [3]]
 
 
 class TestPrediction:

@@ -17,14 +17,7 @@ from roel_service.scene.results import TrackStatus
 from .synthetic import SEGMENTS_WORLD, frames_of, observed, world, world_of
 
 # Everything passes: each test closes the gate it is about.
-OPEN = TrimConfig(
-    max_sigma_m=1e6,
-    max_rms_px=1e6,
-    min_support_ratio=0.0,
-    min_frame_count=1,
-    overlap_distance_m=0.0,
-    min_coverage_count=1,
-)
+OPEN = TrimConfig(max_error_m=1e6, min_coverage_count=1)
 LINES_ONLY = RefineConfig(event_weight=0.0)
 
 
@@ -173,6 +166,7 @@ class TestStatus:
         [
             ({"min_length_m": 5.0}, TrackStatus.TOO_SHORT),
             ({"min_coverage_count": 25}, TrackStatus.TOO_SHORT),
+            ({"max_error_m": 1e-5}, TrackStatus.UNCERTAIN),
             ({"max_sigma_m": 1e-4}, TrackStatus.UNCERTAIN),
             ({"max_rms_px": 1e-3}, TrackStatus.POOR_FIT),
             ({"min_frame_count": 25}, TrackStatus.TOO_FEW_VIEWS),
@@ -193,6 +187,21 @@ class TestStatus:
         line_map, dropped = trimmed(exact, config, tracks, lines)
         assert dropped == [TrackStatus.UNSUPPORTED]
         assert_same_segments(line_map.segments, exact.segments[:1], atol=1e-9)
+
+    @pytest.mark.parametrize("saw", [slice(None), slice(None, None, 3)])
+    def test_the_error_to_expect_is_the_spread_of_its_own_noise_over_the_share_that_saw_it(
+        self, saw
+    ):
+        noisy = world(noise_px=0.1)
+        tracks = LineTracks.from_lists([noisy.tracks[0][saw]])
+        line = noisy.lines.take(np.array([0]))
+        found = trimmed(noisy, OPEN, tracks, line)[0]
+        # 24 frames have it in view.
+        support = len(tracks[0]) / 24
+        error_m = float(found.sigma_m[0] * found.rms_residual_px[0]) / support
+        for factor, kept in ((1.01, 1), (0.99, 0)):
+            config = dataclasses.replace(OPEN, max_error_m=factor * error_m)
+            assert len(trimmed(noisy, config, tracks, line)[0]) == kept
 
     def test_frames_that_look_elsewhere_do_not_count_against_a_line(self):
         exact = world()
