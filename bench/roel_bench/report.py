@@ -148,8 +148,10 @@ def _acceptance(report: _Report) -> str:
         "Means over the rooms that count, and beside them the same with the tuning rooms; what"
         f" passes does so in both.\n\nMet: {len(by_mark[PASS])}. {_listed('Not met', by_mark[FAIL])}"
         f" {_listed('Not run', by_mark[NOT_RUN])}\n\nWhere true edges are lost, how large the IoU"
-        " can be, and why three times LIMAP's cannot be had: [corners](decisions/corners.md). Why"
-        " parts that do not raise the IoU stay: [parts that guard](decisions/parts-that-guard.md)."
+        " can be, and why three times LIMAP's cannot be had: [corners](decisions/corners.md). Which"
+        " parts stay that do not raise the IoU: [parts that guard](decisions/parts-that-guard.md)."
+        " What noisy poses leave: [noisy poses](decisions/noisy-poses.md). What of `events_room01`"
+        " can be covered: [photographed room](decisions/photographed-room.md)."
     )
     headings = ["what", "wanted", "found", "with tuning rooms", ""]
     return _section("What was asked for", text, table(headings, lines))

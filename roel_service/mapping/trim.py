@@ -126,9 +126,8 @@ def _support_ratio(refined: Refined, pieces: _Segments, frames: Frames) -> Float
 def _expected_error_m(sigma_m: FloatArray, rms_px: FloatArray, support: FloatArray) -> FloatArray:
     """(n,) how far off the worse end of a piece is thought to be.
 
-    The spread is that of the line's own noise. Its observations agree with one another all the same
-    where they are not of one edge, or of none: what few of the frames saw that could have is
-    trusted the less.
+    Its standard deviation is taken for the line's own noise. Observations that are of no one edge may
+    agree with one another all the same, so what few frames saw, of those that could, is trusted less.
     """
     return sigma_m * rms_px / support
 
