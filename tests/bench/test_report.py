@@ -97,7 +97,7 @@ def test_page_tells_what_a_part_is_worth():
     page = report.document(RESULTS)
     # 0.3 instead of 0.4, and 0.5 instead of 0.4.
     assert line_of(page, DEFAULT_ABLATION[0].name).endswith("| 25.0 |")
-    assert line_of(page, DEFAULT_ABLATION[1].name).endswith("| -66.7 |")
+    assert line_of(page, DEFAULT_ABLATION[1].name).endswith("| -25.0 |")
 
 
 def test_page_marks_tuning_rooms_and_shows_recordings():
