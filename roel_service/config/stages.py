@@ -328,7 +328,7 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
 
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
     loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
-    loss_scale_px: float = parameter(0.35, POSITIVE)
+    loss_scale_px: float = parameter(0.5, POSITIVE)
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
     direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
@@ -381,7 +381,7 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         pose_drift_s: the time after which they have forgotten it.
     """
 
-    loss_scale_px: float = parameter(0.25, POSITIVE)
+    loss_scale_px: float = parameter(0.35, POSITIVE)
     event_count_per_line: int = parameter(0, NOT_NEGATIVE)
     corner_sigma_m: float = parameter(0.02, NOT_NEGATIVE)
     corner_distance_px: float = parameter(5.0, POSITIVE)
@@ -409,8 +409,6 @@ class TrimConfig(Stage, table="trim"):
         min_pixel_gap_px: gaps below this many pixels at the viewing distance are bridged too.
         min_coverage_count, min_coverage_fraction: frames that must have seen a bin, absolute and
             against the best bin.
-        max_foreshortening: views in which a line looks this many times shorter than it is, nearly
-            end on, do not count (`coverage`).
         end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
         max_error_m: largest error to expect of an end across the line: its standard deviation for
             the line's own residual, over the support ratio.
@@ -428,9 +426,8 @@ class TrimConfig(Stage, table="trim"):
     min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)
     min_coverage_count: int = parameter(4, POSITIVE)
     min_coverage_fraction: float = parameter(0.25, SHARE)
-    max_foreshortening: float = parameter(5.0, Rule(">= 1", lambda value: value >= 1))
     end_cluster_px: float = parameter(5.0, POSITIVE)
-    max_error_m: float = parameter(0.04, POSITIVE)
+    max_error_m: float = parameter(0.06, POSITIVE)
     max_sigma_m: float = parameter(UNLIMITED, POSITIVE)
     max_rms_px: float = parameter(UNLIMITED, POSITIVE)
     min_support_ratio: float = parameter(0.0, SHARE)
