@@ -69,8 +69,8 @@ def test_the_lines_lie_on_the_bars(built):
     assert len(built.line_map) >= 4
     ends = built.line_map.segments.reshape(-1, 3)
     # Pixels are rounded, so a bar is seen within half a pixel: 9 mm at 2.1 m; depth is worse by
-    # the ratio of distance and baseline, about 5.
-    assert distance_to_bars_m(ends).max() < 0.045
+    # the ratio of distance and baseline, about 5, and what may be worse than that is left out.
+    assert distance_to_bars_m(ends).max() < 1.5 * CONFIG.trim.max_error_m
 
 
 def test_the_report_has_the_keys_of_the_command_line(built):
