@@ -38,6 +38,9 @@ MIN_MOVING_SHARE = 0.2
 # Fewer events than this, of a pixel in a second, are noise: the camera rests. What is left of its
 # motion then is about so large, in a window.
 REST_HZ, REST_PX = 3.0, 0.5
+# A line without events moves less than about so much across itself in a window. One that is foretold
+# to move more than `REACH` times this is taken for hidden.
+SILENT_PX = 1.0
 # Steps of a round between two associations.
 STEPS_PER_ROUND = 2
 
@@ -89,6 +92,7 @@ class Evidence:
         in_view_px: length of the lines in view.
         moving_px: length of those that move enough to be seen.
         seen_px: length of those that are seen.
+        moving_px2, seen_px2: areas that both sweep, in which events are to be expected.
         seen_count: pieces that are seen.
     """
 
@@ -97,6 +101,8 @@ class Evidence:
     in_view_px: float
     moving_px: float
     seen_px: float
+    moving_px2: float
+    seen_px2: float
     seen_count: int
 
     @property
@@ -108,6 +114,11 @@ class Evidence:
     def seen_share(self) -> float:
         """Share of the moving lines in view, by length, on which events are."""
         return self.seen_px / self.moving_px if self.moving_px > 0.0 else 0.0
+
+    @property
+    def explained_count(self) -> float:
+        """Events that the lines explain, fewer where lines lack the events that they should have."""
+        return self.on_count * self.seen_px2 / self.moving_px2 if self.moving_px2 > 0.0 else 0.0
 
     @property
     def sharpness(self) -> float:
@@ -124,11 +135,13 @@ class WindowFit:
         state: pose and velocity.
         surprise: distance of the state from the forecast, in deviations of the forecast.
         evidence: agreement of lines and events at that pose.
+        seen: (P,) whether events lie along each piece.
     """
 
     state: MotionState
     surprise: float
     evidence: Evidence
+    seen: BoolArray
 
 
 def window_of(events: EventSlice, ideal_px: Array, span_us: tuple[int, int], most: int) -> Window:
@@ -187,6 +200,10 @@ class _Association:
 
     def speeds_px_per_s(self, state: MotionState) -> FloatArray:
         """(P,) speed of the image of each piece across itself, in its middle."""
+        return np.asarray(np.abs(self.by_pose(state) @ state.velocity))
+
+    def by_pose(self, state: MotionState) -> FloatArray:
+        """(P, 6) how the image of each piece goes across itself when the pose steps, px."""
         pose = state.T_world_camera
         count = len(self.images)
         _, by_pose = image_kernels.distances(
@@ -199,7 +216,7 @@ class _Association:
             self._pieces.segments,
             self._pieces.direction,
         )
-        return np.asarray(np.abs(by_pose @ state.velocity))
+        return np.asarray(by_pose, np.float64)
 
     def support(
         self, residual_px: FloatArray, scale_px: float
@@ -237,12 +254,14 @@ def fit_window(
     view: View,
     config: TrackConfig,
     scales_px: tuple[float, ...],
+    known: BoolArray | None = None,
 ) -> WindowFit:
     """The state in the middle of a window that suits its events and the forecast best.
 
     Args:
         forecast: the prior, at the window's time.
         scales_px: of the rounds: events are taken up within `REACH` times this.
+        known: (P,) pieces that were seen a short time ago: no events on them say that they rest.
     """
     if window.is_quiet:
         forecast = _at_rest(forecast, window.span_s, pieces, view)
@@ -252,10 +271,14 @@ def fit_window(
         association = _Association(state, window, pieces, view, BESIDE[1] * scale_px)
         for _ in range(STEPS_PER_ROUND):
             residual_px, by_pose = association.distances(state)
-            weight = _weights(association, residual_px, view, scale_px, config)
+            support = association.support(residual_px, scale_px)
+            weight = _weights(association, residual_px, support, view, scale_px, config)
             information, slope = image_kernels.normal_equations(
                 residual_px, by_pose, association.after_s, weight
             )
+            if known is not None:
+                silent = known & ~_seen(*support)
+                _add_silence(information, slope, association, silent, state, window.span_s)
             covariance = np.linalg.inv(information + prior_information)
             step = step - covariance @ (slope + prior_information @ step)
             state = forecast.stepped(step, covariance)
@@ -263,12 +286,14 @@ def fit_window(
         state=state,
         surprise=float(np.sqrt(step @ prior_information @ step)),
         evidence=_evidence(association, state, scales_px[-1], window.span_s),
+        seen=_seen(*support),
     )
 
 
 def _weights(
     association: _Association,
     residual_px: FloatArray,
+    support: tuple[IntArray, IntArray, FloatArray],
     view: View,
     scale_px: float,
     config: TrackConfig,
@@ -279,13 +304,34 @@ def _weights(
     """
     count = len(association.images)
     near = np.maximum(0.0, 1.0 - np.square(residual_px / (REACH * scale_px)))
-    seen = _seen(*association.support(residual_px, scale_px))
+    seen = _seen(*support)
     tukey = np.square(near) * seen[association.piece]
     weight_of_piece = np.bincount(association.piece, tukey, count)
     depth_m = np.where(association.depths_m > 0.0, association.depths_m, np.inf)
     line_px2 = config.line_noise_px**2 + np.square(config.line_noise_m * view.K[0, 0] / depth_m)
     event_px2 = (config.event_noise_px * scale_px) ** 2
     return np.asarray(tukey / (event_px2 + weight_of_piece * line_px2)[association.piece])
+
+
+def _add_silence(
+    information: FloatArray,
+    slope: FloatArray,
+    association: _Association,
+    silent: BoolArray,
+    state: MotionState,
+    span_s: float,
+) -> None:
+    """Add what lines without events say, which is that they do not move across themselves.
+
+    Where all lines of a direction rest in the picture, nothing else holds the motion across them.
+    """
+    silent = silent & (association.length_px >= MIN_LENGTH_PX)
+    by_velocity = span_s * association.by_pose(state)[silent]
+    motion_px = by_velocity @ state.velocity
+    near = np.maximum(0.0, 1.0 - np.square(motion_px / (REACH * SILENT_PX)))
+    weight = np.square(near) / SILENT_PX**2
+    information[6:, 6:] += (weight[:, None] * by_velocity).T @ by_velocity
+    slope[6:] += by_velocity.T @ (weight * motion_px)
 
 
 def _seen(on: IntArray, beside: IntArray, occupied: FloatArray) -> BoolArray:
@@ -323,5 +369,7 @@ def _evidence(
         in_view_px=float(length_px[length_px >= MIN_LENGTH_PX].sum()),
         moving_px=float(length_px[tells].sum()),
         seen_px=float(length_px[seen].sum()),
+        moving_px2=float((length_px * motion_px)[tells].sum()),
+        seen_px2=float((length_px * motion_px)[seen].sum()),
         seen_count=int(seen.sum()),
     )

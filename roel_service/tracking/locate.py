@@ -1,4 +1,4 @@
-"""Where the camera is, from a rough guess: lines of one moment laid onto the lines of the map.
+"""Where the camera may be, from a rough guess: lines of one moment laid onto those of the map.
 
 Poses all over the reach of the guess are scored by fields of nearness to the lines that are seen,
 one field for each direction; the best ones breed closer ones while the fields get narrower. What is
@@ -8,30 +8,22 @@ left is fitted to the space-time planes of the lines, which tell the velocity to
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
 from roel_service.arrays import Array, FloatArray
-from roel_service.config.stages import DetectConfig, FramesConfig, PlaneFitConfig, TrackConfig
+from roel_service.config.stages import TrackConfig
 from roel_service.geometry import segments
 from roel_service.geometry.se3 import SE3
-from roel_service.mapping.detect import EDLines, detect_lines
-from roel_service.mapping.frames import event_frame
-from roel_service.mapping.plane_fit import FittedLines, fit_space_time_planes
-from roel_service.mapping.representations import event_images
-from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventStream
-from roel_service.scene.trajectory import Trajectory
+from roel_service.mapping.plane_fit import FittedLines
 from roel_service.tracking import search_kernels
 from roel_service.tracking.fit import MIN_DEPTH_SHARE, View, Window, WindowFit, fit_window
 from roel_service.tracking.motion import MotionState
-from roel_service.tracking.pieces import MapPieces, equal_parts
+from roel_service.tracking.sight import Eyes
+from roel_service.tracking.pieces import equal_parts
 
-# Lines of one moment: without poses nothing undoes motion, so one window, and a short one.
-FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
-DETECT = DetectConfig(window_events_per_pixel=(0.1,))
 # Directions that are told apart, of half a turn.
 DIRECTION_COUNT = 12
 # Pixels of a cell of the fields, and how near is near in each round, both shares of the focal
@@ -44,6 +36,8 @@ TURN_STEP, SHIFT_STEP = 0.3, 0.5
 KEPT_COUNT, CHILD_COUNT = 40, 24
 # Poses that are fitted in the end, at least this far apart as shares of the reach.
 FITTED_COUNT, APART = 6, 0.15
+# Poses this close are one.
+SAME_DEG, SAME_M = 0.5, 0.01
 # Points of a seen line are so far apart, in its direction and in time.
 POINT_PX, MOMENTS_S = 2.0, (-0.005, 0.0, 0.005)
 # So many cells from any line, nothing is near.
@@ -55,61 +49,60 @@ POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 120.0, 1.5
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Eyes:
-    """What turns events into lines, and where lines are looked for.
-
-    Attributes:
-        camera: calibration.
-        ideal_px: (H, W, 2) undistortion table.
-        view: calibration of the ideal picture.
-        pieces: of the map.
-    """
-
-    camera: Camera
-    ideal_px: Array
-    view: View
-    pieces: MapPieces
-
-
 def locate(
     guess: SE3,
-    events: EventStream,
+    lines: FittedLines,
     window: Window,
     eyes: Eyes,
     config: TrackConfig,
     rng: np.random.Generator,
-) -> WindowFit | None:
-    """The state in the middle of a window, within the configured reach of a guess.
+) -> list[WindowFit]:
+    """States in the middle of a window, within the configured reach of a guess, the best first.
 
     Args:
         guess: rough `T_world_camera`.
-        events: around the middle of the window.
+        lines: that are seen in the middle of the window, with their speeds.
         window: the events of one interval.
         rng: draws the poses that are tried.
 
     Returns:
-        The best fit there is, however poor; None where no line is seen.
+        Fits that lie apart, however poor; none where no line is seen.
     """
-    lines = _seen_lines(events, window.t_us, eyes)
     if len(lines.polarity) == 0:
-        return None
+        return []
     poses = _search(guess, lines, eyes, config, rng)
     sampled = _sampled(lines, window.t_us)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
         for state in (_unmoved(pose, window.t_us, config) for pose in poses)
     ]
-    best = sorted(fits, key=_explained, reverse=True)[:2]
+    best = distinct(sorted(fits, key=explained_count, reverse=True))
     on_events = [
         fit_window(fit.state, window, eyes.pieces, eyes.view, config, EVENT_SCALES_PX)
         for fit in best
     ]
-    return max(on_events, key=_explained)
+    return distinct(sorted(on_events, key=explained_count, reverse=True))
 
 
-def _explained(fit: WindowFit) -> float:
-    return fit.evidence.seen_px * fit.evidence.seen_share
+def explained_count(fit: WindowFit) -> float:
+    """Events that a fit explains."""
+    return fit.evidence.explained_count
+
+
+def distinct(fits: Sequence[WindowFit]) -> list[WindowFit]:
+    """The first fits of which none is the same pose as an earlier one."""
+    kept: list[WindowFit] = []
+    for fit in fits:
+        if not any(is_same_pose(fit.state, other.state) for other in kept):
+            kept.append(fit)
+    return kept
+
+
+def is_same_pose(one: MotionState, other: MotionState) -> bool:
+    """Whether two poses are nearer than what tells them apart."""
+    step = one.T_world_camera.local(other.T_world_camera)
+    turn_rad, shift_m = np.linalg.norm(step.reshape(2, 3), axis=1)
+    return bool(turn_rad < np.deg2rad(SAME_DEG) and shift_m < SAME_M)
 
 
 def _unmoved(pose: SE3, t_us: int, config: TrackConfig) -> MotionState:
@@ -126,18 +119,6 @@ def _unmoved(pose: SE3, t_us: int, config: TrackConfig) -> MotionState:
         velocity=np.zeros(6),
         covariance=np.diag(np.square(deviation)),
     )
-
-
-def _seen_lines(events: EventStream, t_us: int, eyes: Eyes) -> FittedLines:
-    """Lines at one time with their speeds, without any poses."""
-    # The frame asks for poses, but with compensation off it does not look at them.
-    still = Trajectory(
-        t_us=np.array([t_us, t_us + 1]),
-        T_world_camera=SE3(rotation=np.stack([np.eye(3)] * 2), translation=np.zeros((2, 3))),
-    )
-    frame = event_frame(events, t_us, eyes.ideal_px, still, eyes.camera, FRAMES, DETECT)
-    seeds = detect_lines(event_images(frame, DETECT), EDLines(DETECT), DETECT)
-    return fit_space_time_planes(seeds, frame, PlaneFitConfig(), np.random.default_rng(0))
 
 
 def _sampled(lines: FittedLines, t_us: int) -> Window:

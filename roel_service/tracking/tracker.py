@@ -15,24 +15,20 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream, time_not_monotone
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
-from roel_service.tracking.fit import View, Window, WindowFit, fit_window, window_of
-from roel_service.tracking.locate import EVENT_SCALES_PX, Eyes, locate
-from roel_service.tracking.motion import MotionState
+from roel_service.tracking.fit import View, Window, WindowFit, window_of
+from roel_service.tracking.follower import Follower, rivals
+from roel_service.tracking.locate import locate
 from roel_service.tracking.pieces import pieces_of
-from roel_service.tracking.verdict import Verdict, is_possible
+from roel_service.tracking.sight import Eyes, glimpse, look
+from roel_service.tracking.verdict import is_possible
+from roel_service.tracking.whereabouts import Whereabouts
 
 # To be found, a pose needs events this far around it; to be followed, those of its interval do.
 FINDING_HALF_US = 25_000
 # A lost pose is looked for in so many intervals at once, and in every so many after that.
 FINDING_AT_ONCE, FINDING_STRIDE = 4, 7
-# A camera that is out of sight goes on for so long, at the most.
-MAX_COAST_S = 1.0
-# Each time it is looked for around another place; these wander off as a hand-held camera does.
-WANDER_M_S, WANDER_DEG_S = 0.2, 15.0
-MAX_WANDER_S = 3.0
 # Without events for so long, the camera may be anywhere within reach.
 MAX_SILENCE_US = 500_000
-
 
 class PoseTracker:
     """Follows a camera: events in, one pose for each interval out.
@@ -63,18 +59,12 @@ class PoseTracker:
         self._rng = np.random.default_rng(seed)
         self._buffer: EventStream | None = None
         self._next_us = 0
-        self._state: MotionState | None = None
-        self._verdict = Verdict()
+        self._followers: list[Follower] = []
         self.guess(guess)
 
     def guess(self, T_world_camera: SE3) -> None:
         """Give up what is known, and look around another pose."""
-        self._last = MotionState(
-            t_us=self._next_us,
-            T_world_camera=T_world_camera,
-            velocity=np.zeros(6),
-            covariance=np.zeros((12, 12)),
-        )
+        self._whereabouts = Whereabouts(T_world_camera, self._next_us)
         self._lose()
 
     def push(self, events: EventStream) -> list[TrackedPose]:
@@ -121,7 +111,7 @@ class PoseTracker:
     def _reach_us(self) -> int:
         """Time after the next pose of which events are needed."""
         half_us = self._config.interval_us - self._config.interval_us // 2
-        return max(half_us, FINDING_HALF_US) if self._state is None else half_us
+        return max(half_us, FINDING_HALF_US) if not self._followers else half_us
 
     def _pose(self, buffer: EventStream) -> TrackedPose:
         """The next interval's pose."""
@@ -131,49 +121,60 @@ class PoseTracker:
         events = buffer.slice(int(start), int(stop), self._next_us)
         window = window_of(events, self._eyes.ideal_px, span_us, self._config.max_event_count)
         self._next_us += self._config.interval_us
-        if self._state is None:
-            return self._found(window, buffer)
-        return self._followed(self._state, window)
+        if self._followers:
+            return self._followed(window, buffer)
+        return self._found(window, buffer)
 
-    def _followed(self, state: MotionState, window: Window) -> TrackedPose:
-        eyes = self._eyes
-        forecast = state.foretold(window.t_us, self._config)
-        fit = fit_window(forecast, window, eyes.pieces, eyes.view, self._config, EVENT_SCALES_PX)
-        status = self._verdict.of(fit, self._config)
-        if status is PoseStatus.LOST:
+    def _followed(self, window: Window, buffer: EventStream) -> TrackedPose:
+        for follower in self._followers:
+            follower.follow(window, self._eyes, self._config)
+        best = max(self._followers, key=lambda each: each.explained_count)
+        alive = [each for each in self._followers if each.status is not PoseStatus.LOST]
+        if not alive:
             self._lose()
-            return _lost(window, fit)
-        self._state = fit.state
+            return _lost(window, best.fit)
+        if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1:
+            alive += self._second_opinions(window, buffer, best)
+        best, *others = self._followers = rivals(alive)
+        status = PoseStatus.UNCERTAIN if others else best.status
         if status is PoseStatus.TRACKING:
-            self._last = fit.state
-        return _told(window, status, fit)
+            self._whereabouts.relied_on(best.state)
+        self._unsure_count = 0 if status is PoseStatus.TRACKING else self._unsure_count + 1
+        turn_rate = best.state.T_world_camera.rotation.T @ best.state.velocity[:3]
+        self._whereabouts.turned(turn_rate, window.span_s)
+        return _told(window, status, best.fit)
+
+    def _second_opinions(
+        self, window: Window, buffer: EventStream, best: Follower
+    ) -> list[Follower]:
+        """Other answers near one that does not convince, as if they had been followed so far."""
+        state, before = best.state, best.explained_count / best.fit.evidence.explained_count
+        turn_rate = state.T_world_camera.rotation.T @ state.velocity[:3]
+        sight = look(buffer, window.t_us, self._eyes, turn_rate)
+        place = state.T_world_camera
+        fits = locate(place, sight.lines, window, self._eyes, self._config, self._rng)
+        return [Follower(fit, before) for fit in fits if is_possible(fit, self._config)]
 
     def _found(self, window: Window, buffer: EventStream) -> TrackedPose:
-        self._lost_count += 1
-        if self._lost_count > FINDING_AT_ONCE and self._lost_count % FINDING_STRIDE:
-            return _lost(window, None)
-        fit = locate(
-            self._place_to_look(window.t_us), buffer, window, self._eyes, self._config, self._rng
-        )
-        if fit is None or not is_possible(fit, self._config):
-            return _lost(window, fit)
-        self._state = fit.state
-        self._verdict = Verdict()
-        return _told(window, PoseStatus.UNCERTAIN, fit)
+        """Look for the camera, now and then; see how it turns, all the time."""
+        self._whereabouts.lost(window.t_us)
+        turn_rate = glimpse(buffer, window.t_us, self._eyes).turn_rate
+        attempt, self._lost_count = self._lost_count, self._lost_count + 1
+        fits: list[WindowFit] = []
+        if attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0:
+            sight = look(buffer, window.t_us, self._eyes, turn_rate)
+            place = self._whereabouts.place(window.t_us, attempt, self._rng)
+            fits = locate(place, sight.lines, window, self._eyes, self._config, self._rng)
+        self._whereabouts.turned(turn_rate, window.span_s)
+        possible = [fit for fit in fits if is_possible(fit, self._config)]
+        if not possible:
+            return _lost(window, fits[0] if fits else None)
+        self._followers = rivals([Follower(fit) for fit in possible])
+        return _told(window, PoseStatus.UNCERTAIN, self._followers[0].fit)
 
     def _lose(self) -> None:
-        self._state = None
-        self._lost_count = 0
-
-    def _place_to_look(self, t_us: int) -> SE3:
-        """Where the last motion that could be relied on leads or began, and ever farther around it."""
-        went_on = self._lost_count % 2 == 1
-        after_s = (t_us - self._last.t_us) * 1e-6 if went_on else 0.0
-        place = self._last.poses(np.array(np.clip(after_s, 0.0, MAX_COAST_S)))
-        lost_s = (self._lost_count - 1) * self._config.interval_us * 1e-6
-        deviation = np.array([np.deg2rad(WANDER_DEG_S)] * 3 + [WANDER_M_S] * 3)
-        wandered = self._rng.normal(size=6) * deviation * min(lost_s, MAX_WANDER_S)
-        return place.retract(wandered)
+        self._followers = []
+        self._lost_count = self._unsure_count = 0
 
 
 def _told(window: Window, status: PoseStatus, fit: WindowFit) -> TrackedPose:

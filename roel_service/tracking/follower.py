@@ -1,0 +1,72 @@
+"""One answer to where the camera is, followed from window to window."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from roel_service.config.stages import TrackConfig
+from roel_service.scene.results import PoseStatus
+from roel_service.tracking.fit import Window, WindowFit, fit_window
+from roel_service.tracking.locate import EVENT_SCALES_PX, is_same_pose
+from roel_service.tracking.motion import MotionState
+from roel_service.tracking.sight import Eyes
+from roel_service.tracking.verdict import Verdict
+
+# A line that was seen so long ago is known to be in sight: it is not hidden, if it has no events.
+MEMORY_US = 300_000
+LONG_AGO_US = -(1 << 60)
+# What a window explained counts less in every later one.
+FADE = 0.8
+# Another answer that explains this share of what the best one does is a rival.
+RIVAL_SHARE = 0.9
+MAX_FOLLOWER_COUNT = 3
+
+
+class Follower:
+    """A motion that began with a fit.
+
+    Args:
+        fit: the first one.
+        before: what it explains counts so many times, in place of windows before it.
+
+    Attributes:
+        fit: the last window's.
+        status: what the windows say of this answer alone.
+        explained_count: events that it explained, the last ones above all.
+    """
+
+    def __init__(self, fit: WindowFit, before: float = 1.0) -> None:
+        self.fit = fit
+        self.status = PoseStatus.UNCERTAIN
+        self.explained_count = before * fit.evidence.explained_count
+        self._verdict = Verdict()
+        self._seen_us = np.full(len(fit.seen), LONG_AGO_US)
+
+    @property
+    def state(self) -> MotionState:
+        return self.fit.state
+
+    def follow(self, window: Window, eyes: Eyes, config: TrackConfig) -> None:
+        """Go on to the next window."""
+        forecast = self.state.foretold(window.t_us, config)
+        known = window.t_us - self._seen_us <= MEMORY_US
+        self.fit = fit_window(
+            forecast, window, eyes.pieces, eyes.view, config, EVENT_SCALES_PX, known
+        )
+        self._seen_us[self.fit.seen] = window.t_us
+        self.status = self._verdict.of(self.fit, config)
+        self.explained_count *= FADE
+        self.explained_count += self.fit.evidence.explained_count
+
+
+def rivals(followers: Sequence[Follower]) -> list[Follower]:
+    """The best answer, and others that explain nearly as much."""
+    kept: list[Follower] = []
+    for follower in sorted(followers, key=lambda each: each.explained_count, reverse=True):
+        if kept and follower.explained_count < RIVAL_SHARE * kept[0].explained_count:
+            break
+        if not any(is_same_pose(follower.state, other.state) for other in kept):
+            kept.append(follower)
+    return kept[:MAX_FOLLOWER_COUNT]

@@ -1,0 +1,131 @@
+"""What a camera sees when nobody knows where it is: lines of one moment, and how fast it turns.
+
+Lines and their speeds are found in the events as they are. The speeds tell a turn that moves the
+picture as the camera does, its shift being taken for a turn; with that undone, the events of a
+longer time make twice as many lines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from roel_service.arrays import Array, FloatArray
+from roel_service.config.stages import DetectConfig, FramesConfig, PlaneFitConfig
+from roel_service.geometry import segments
+from roel_service.geometry.projection import normalized_from_pixel
+from roel_service.geometry.se3 import SE3
+from roel_service.mapping.detect import EDLines, detect_lines
+from roel_service.mapping.frames import event_frame
+from roel_service.mapping.plane_fit import FittedLines, fit_space_time_planes
+from roel_service.mapping.representations import event_images
+from roel_service.scene.camera import Camera
+from roel_service.scene.events import EventStream
+from roel_service.scene.trajectory import Trajectory
+from roel_service.tracking.fit import View
+from roel_service.tracking.pieces import MapPieces
+
+# While nothing undoes the motion: one window, and a short one.
+BLURRED_FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
+BLURRED_DETECT = DetectConfig(window_events_per_pixel=(0.1,))
+SHARP_FRAMES, SHARP_DETECT = FramesConfig(), DetectConfig()
+# A turn is taken to be even for so long around a moment.
+EVEN_US = 100_000
+# Speeds of lines are known about so well; a camera turns about so fast.
+SPEED_NOISE_PX_S, TURN_SIGMA_RAD_S = 60.0, 2.0
+ROBUST_STEP_COUNT = 8
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Eyes:
+    """What turns events into lines, and where lines are looked for.
+
+    Attributes:
+        camera: calibration.
+        ideal_px: (H, W, 2) undistortion table.
+        view: calibration of the ideal picture.
+        pieces: of the map.
+    """
+
+    camera: Camera
+    ideal_px: Array
+    view: View
+    pieces: MapPieces
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sight:
+    """What the events around one moment show.
+
+    Attributes:
+        lines: with their speeds in the picture.
+        turn_rate: (3,) rad/s, in camera axes, that moves the picture as the camera does.
+    """
+
+    lines: FittedLines
+    turn_rate: FloatArray
+
+
+def glimpse(events: EventStream, t_us: int, eyes: Eyes) -> Sight:
+    """Lines as they are in the events, and the turn that they tell."""
+    lines = _lines(events, t_us, eyes, np.zeros(3), BLURRED_FRAMES, BLURRED_DETECT)
+    return Sight(lines=lines, turn_rate=_turn_rate(lines, eyes.view))
+
+
+def look(events: EventStream, t_us: int, eyes: Eyes, turn_rate: FloatArray) -> Sight:
+    """Lines once a turn is undone."""
+    lines = _lines(events, t_us, eyes, turn_rate, SHARP_FRAMES, SHARP_DETECT)
+    undone_px_ms = 1e-3 * _speeds_by_turn(lines.segments_px, eyes.view) @ turn_rate
+    lines = replace(lines, normal_speed_px_per_ms=lines.normal_speed_px_per_ms + undone_px_ms)
+    return Sight(lines=lines, turn_rate=turn_rate)
+
+
+def _lines(
+    events: EventStream,
+    t_us: int,
+    eyes: Eyes,
+    turn_rate: FloatArray,
+    frames: FramesConfig,
+    detect: DetectConfig,
+) -> FittedLines:
+    frame = event_frame(
+        events, t_us, eyes.ideal_px, _turning(t_us, turn_rate), eyes.camera, frames, detect
+    )
+    seeds = detect_lines(event_images(frame, detect), EDLines(detect), detect)
+    # The planes are voted for: nothing is drawn.
+    return fit_space_time_planes(seeds, frame, PlaneFitConfig(), np.random.default_rng(0))
+
+
+def _turning(t_us: int, turn_rate: FloatArray) -> Trajectory:
+    """A camera that turns evenly on the spot."""
+    here = SE3(rotation=np.eye(3), translation=np.zeros(3))
+    steps = np.array([-1.0, 0.0, 1.0])[:, None] * 1e-6 * EVEN_US * turn_rate
+    poses = here.retract(np.concatenate([steps, np.zeros((3, 3))], axis=1))
+    return Trajectory(t_us=t_us + np.array([-EVEN_US, 0, EVEN_US]), T_world_camera=poses)
+
+
+def _turn_rate(lines: FittedLines, view: View) -> FloatArray:
+    """(3,) rad/s that explains the speeds of most lines (Cauchy's loss, by length)."""
+    by_turn = _speeds_by_turn(lines.segments_px, view)
+    speed_px_s = 1e3 * lines.normal_speed_px_per_ms
+    length_px = segments.length(lines.segments_px)
+    prior = np.eye(3) / TURN_SIGMA_RAD_S**2
+    weight = length_px / max(float(length_px.mean()), 1.0) if len(length_px) else length_px
+    turn_rate = np.zeros(3)
+    robust = np.ones(len(length_px))
+    for _ in range(ROBUST_STEP_COUNT):
+        rows = (weight * robust / SPEED_NOISE_PX_S**2)[:, None] * by_turn
+        turn_rate = np.linalg.solve(rows.T @ by_turn + prior, rows.T @ speed_px_s)
+        residual = (by_turn @ turn_rate - speed_px_s) / SPEED_NOISE_PX_S
+        robust = 1.0 / (1.0 + np.square(residual))
+    return np.asarray(turn_rate)
+
+
+def _speeds_by_turn(segments_px: FloatArray, view: View) -> FloatArray:
+    """(M, 3) speeds px/s of lines along their left normals, by a turn of the camera of 1 rad/s."""
+    u, v = normalized_from_pixel(segments_px.mean(axis=1), view.K).T
+    along_u = np.stack([u * v, -(1.0 + u * u), v], axis=1) * view.K[0, 0]
+    along_v = np.stack([1.0 + v * v, -u * v, -u], axis=1) * view.K[1, 1]
+    normal = segments.left_normal(segments_px)
+    return np.asarray(normal[:, :1] * along_u + normal[:, 1:] * along_v)

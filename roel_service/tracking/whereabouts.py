@@ -1,0 +1,66 @@
+"""Where to look for a camera that is out of sight, and how far around."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roel_service.arrays import FloatArray
+from roel_service.geometry.se3 import SE3, rotation_from_vector
+from roel_service.tracking.motion import MotionState
+
+# A camera without events goes on as before for so long, at the most.
+MAX_COAST_S = 1.0
+# It may have come off that by so much for every second of it.
+COAST_SIGMA_DEG_S, COAST_SIGMA_M_S = 20.0, 0.3
+# And while it is out of sight, its turns being seen, by so much a second, for so long.
+WANDER_DEG_S, WANDER_M_S, MAX_WANDER_S = 8.0, 0.3, 3.0
+
+
+class Whereabouts:
+    """The last place that could be relied on, and what was seen of the motion since."""
+
+    def __init__(self, T_world_camera: SE3, t_us: int) -> None:
+        self.relied_on(_at_rest(T_world_camera, t_us))
+
+    def relied_on(self, state: MotionState) -> None:
+        """The camera is here."""
+        self._last = state
+        self._lost_us: int | None = None
+        self._turned = np.eye(3)
+
+    def lost(self, t_us: int) -> None:
+        """It is out of sight from now on, unless it was so before."""
+        if self._lost_us is None:
+            self._lost_us = t_us
+
+    def turned(self, turn_rate: FloatArray, after_s: float) -> None:
+        """It turned while it was out of sight, by (3,) rad/s in its own axes."""
+        if self._lost_us is not None:
+            self._turned = self._turned @ rotation_from_vector(after_s * turn_rate)
+
+    def place(self, t_us: int, attempt: int, rng: np.random.Generator) -> SE3:
+        """A place to look at, another one at each attempt."""
+        lost_us = t_us if self._lost_us is None else self._lost_us
+        coast_s = min(MAX_COAST_S, max(0, lost_us - self._last.t_us) * 1e-6)
+        wander_s = min(MAX_WANDER_S, (t_us - lost_us) * 1e-6)
+        # First where the motion leads, then anywhere on the way there.
+        share = 1.0 if attempt == 0 else rng.uniform()
+        place = self._last.poses(np.array(share * coast_s))
+        turned = SE3(rotation=place.rotation @ self._turned, translation=place.translation)
+        deviation = _deviation(coast_s, COAST_SIGMA_DEG_S, COAST_SIGMA_M_S)
+        deviation += _deviation(wander_s, WANDER_DEG_S, WANDER_M_S)
+        return turned.retract(rng.normal(size=6) * deviation * (attempt > 0))
+
+
+def _deviation(after_s: float, turn_deg_s: float, shift_m_s: float) -> FloatArray:
+    """(6,) of a pose step, after a time."""
+    return after_s * np.array([np.deg2rad(turn_deg_s)] * 3 + [shift_m_s] * 3)
+
+
+def _at_rest(T_world_camera: SE3, t_us: int) -> MotionState:
+    return MotionState(
+        t_us=t_us,
+        T_world_camera=T_world_camera,
+        velocity=np.zeros(6),
+        covariance=np.zeros((12, 12)),
+    )
