@@ -64,7 +64,9 @@ class PoseTracker:
 
     def guess(self, T_world_camera: SE3) -> None:
         """Give up what is known, and look around another pose."""
-        self._whereabouts = Whereabouts(T_world_camera, self._next_us)
+        self._whereabouts = Whereabouts(
+            T_world_camera, self._next_us, self._eyes.pieces.extent_m
+        )
         self._lose()
 
     def push(self, events: EventStream) -> list[TrackedPose]:

@@ -13,20 +13,26 @@ MAX_COAST_S = 1.0
 # It may have come off that by so much for every second of it.
 COAST_SIGMA_DEG_S, COAST_SIGMA_M_S = 20.0, 0.3
 # And while it is out of sight, its turns being seen, by so much a second, for so long.
-WANDER_DEG_S, WANDER_M_S, MAX_WANDER_S = 8.0, 0.3, 3.0
+WANDER_DEG_S, WANDER_M_S, MAX_WANDER_S = 5.0, 0.2, 3.0
+# A shift aside looks like a turn: up to this share of what is seen may be one, of a scene that is
+# this share of the map's extent away.
+MAX_SHIFT_SHARE, DEPTH_SHARE = 0.6, 0.25
+# Turns that are remembered, one a window.
+MAX_TURN_COUNT = 200
 
 
 class Whereabouts:
     """The last place that could be relied on, and what was seen of the motion since."""
 
-    def __init__(self, T_world_camera: SE3, t_us: int) -> None:
+    def __init__(self, T_world_camera: SE3, t_us: int, extent_m: float) -> None:
+        self._depth_m = DEPTH_SHARE * extent_m
         self.relied_on(_at_rest(T_world_camera, t_us))
 
     def relied_on(self, state: MotionState) -> None:
         """The camera is here."""
         self._last = state
         self._lost_us: int | None = None
-        self._turned = np.eye(3)
+        self._turns: list[FloatArray] = []
 
     def lost(self, t_us: int) -> None:
         """It is out of sight from now on, unless it was so before."""
@@ -36,7 +42,8 @@ class Whereabouts:
     def turned(self, turn_rate: FloatArray, after_s: float) -> None:
         """It turned while it was out of sight, by (3,) rad/s in its own axes."""
         if self._lost_us is not None:
-            self._turned = self._turned @ rotation_from_vector(after_s * turn_rate)
+            self._turns.append(after_s * turn_rate)
+            del self._turns[:-MAX_TURN_COUNT]
 
     def place(self, t_us: int, attempt: int, rng: np.random.Generator) -> SE3:
         """A place to look at, another one at each attempt."""
@@ -46,10 +53,19 @@ class Whereabouts:
         # First where the motion leads, then anywhere on the way there.
         share = 1.0 if attempt == 0 else rng.uniform()
         place = self._last.poses(np.array(share * coast_s))
-        turned = SE3(rotation=place.rotation @ self._turned, translation=place.translation)
+        turned = self._moved_on(place, rng.uniform(0.0, MAX_SHIFT_SHARE))
         deviation = _deviation(coast_s, COAST_SIGMA_DEG_S, COAST_SIGMA_M_S)
         deviation += _deviation(wander_s, WANDER_DEG_S, WANDER_M_S)
         return turned.retract(rng.normal(size=6) * deviation * (attempt > 0))
+
+    def _moved_on(self, place: SE3, shift_share: float) -> SE3:
+        """A place after all turns that were seen, a share of which were shifts."""
+        rotation, centre = place.rotation, place.translation
+        for turn in self._turns:
+            aside = np.array([turn[1], -turn[0], 0.0])
+            centre = centre + rotation @ (shift_share * self._depth_m * aside)
+            rotation = rotation @ rotation_from_vector((1.0 - shift_share) * turn)
+        return SE3(rotation=rotation, translation=centre)
 
 
 def _deviation(after_s: float, turn_deg_s: float, shift_m_s: float) -> FloatArray:
