@@ -136,12 +136,16 @@ class WindowFit:
         surprise: distance of the state from the forecast, in deviations of the forecast.
         evidence: agreement of lines and events at that pose.
         seen: (P,) whether events lie along each piece.
+        information: (12, 12) what the window says of a step of the state.
+        information_of_edges: (E, 12, 12) what the edges that have events say each.
     """
 
     state: MotionState
     surprise: float
     evidence: Evidence
     seen: BoolArray
+    information: FloatArray
+    information_of_edges: FloatArray
 
 
 def window_of(events: EventSlice, ideal_px: Array, span_us: tuple[int, int], most: int) -> Window:
@@ -190,6 +194,7 @@ class _Association:
         self.xy_px, self.slot = window.xy_px[near], window.slot[near]
         self.slot_s = window.slot_s
         self.after_s = window.slot_s[self.slot]
+        self.edge = pieces.edge[self.piece]
         self._pieces, self._K = pieces, view.K
 
     @property
@@ -287,6 +292,16 @@ def fit_window(
         surprise=float(np.sqrt(step @ prior_information @ step)),
         evidence=_evidence(association, state, scales_px[-1], window.span_s),
         seen=_seen(*support),
+        information=information,
+        information_of_edges=_by_edge(association, by_pose, weight),
+    )
+
+
+def _by_edge(association: _Association, by_pose: FloatArray, weight: FloatArray) -> FloatArray:
+    """(E, 12, 12) information of each edge that has events."""
+    known, edge = np.unique(association.edge, return_inverse=True)
+    return np.asarray(
+        image_kernels.information_by_edge(by_pose, association.after_s, weight, edge, len(known))
     )
 
 
@@ -304,7 +319,7 @@ def _weights(
     """
     count = len(association.images)
     near = np.maximum(0.0, 1.0 - np.square(residual_px / (REACH * scale_px)))
-    seen = _seen(*support)
+    seen = _seen(*support) & (association.length_px >= MIN_LENGTH_PX)
     tukey = np.square(near) * seen[association.piece]
     weight_of_piece = np.bincount(association.piece, tukey, count)
     depth_m = np.where(association.depths_m > 0.0, association.depths_m, np.inf)

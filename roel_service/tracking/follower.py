@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from roel_service.arrays import FloatArray
 from roel_service.config.stages import TrackConfig
 from roel_service.scene.results import PoseStatus
 from roel_service.tracking.fit import Window, WindowFit, fit_window
 from roel_service.tracking.locate import EVENT_SCALES_PX, is_same_pose
-from roel_service.tracking.motion import MotionState
+from roel_service.tracking.motion import MotionState, faded
 from roel_service.tracking.sight import Eyes
 from roel_service.tracking.verdict import Verdict, convinces
 
@@ -44,6 +45,7 @@ class Follower:
         self.status = PoseStatus.UNCERTAIN
         self.explained_count = before * fit.evidence.explained_count
         self._verdict = Verdict()
+        self._cautious = fit.state.covariance
         self._seen_us = np.full(len(fit.seen), LONG_AGO_US)
 
     @property
@@ -54,14 +56,30 @@ class Follower:
         """Go on to the next window."""
         forecast = self.state.foretold(window.t_us, config)
         known = window.t_us - self._seen_us <= MEMORY_US
+        after_s = (window.t_us - self.state.t_us) * 1e-6
         scales_px = EVENT_SCALES_PX if convinces(self.fit, config) else UNSURE_SCALES_PX
         self.fit = fit_window(
             forecast, window, eyes.pieces, eyes.view, config, scales_px, known
         )
         self._seen_us[self.fit.seen] = window.t_us
-        self.status = self._verdict.of(self.fit, config)
+        self._cautious = _cautious(faded(self._cautious, after_s, config), self.fit)
+        self.status = self._verdict.of(self.fit, self._cautious, config)
         self.explained_count *= FADE
         self.explained_count += self.fit.evidence.explained_count
+
+
+def _cautious(forecast: FloatArray, fit: WindowFit) -> FloatArray:
+    """(12, 12) covariance of the state if the edge that it needs most is not what it seems.
+
+    Args:
+        forecast: (12, 12) the same before the window.
+    """
+    without = np.linalg.inv(forecast) + fit.information - fit.information_of_edges
+    if len(without) == 0:
+        return forecast
+    covariances = np.linalg.inv(without)
+    shift = np.linalg.eigvalsh(covariances[:, 3:6, 3:6])[:, -1]
+    return np.asarray(covariances[np.argmax(shift)])
 
 
 def rivals(followers: Sequence[Follower]) -> list[Follower]:

@@ -237,6 +237,33 @@ def normal_equations(
 
 
 @numba.njit(cache=True, nogil=True)
+def information_by_edge(
+    by_pose: FloatArray, after_s: FloatArray, weight: FloatArray, edge: IntArray, edge_count: int
+) -> FloatArray:
+    """(E, 12, 12) what the events of each edge contribute to `normal_equations`.
+
+    Args:
+        by_pose, after_s, weight: of `normal_equations`.
+        edge: (K,) of each event.
+        edge_count: E.
+    """
+    information = np.zeros((edge_count, 12, 12))
+    row = np.empty(12)
+    for k in range(len(weight)):
+        if weight[k] == 0.0:
+            continue
+        for i in range(6):
+            row[i] = by_pose[k, i]
+            row[i + 6] = after_s[k] * by_pose[k, i]
+        sums = information[edge[k]]
+        for i in range(12):
+            share = weight[k] * row[i]
+            for j in range(12):
+                sums[i, j] += share * row[j]
+    return information
+
+
+@numba.njit(cache=True, nogil=True)
 def support(
     xy_px: FloatArray,
     piece: Array,

@@ -51,13 +51,18 @@ class MotionState:
     def foretold(self, t_us: int, config: TrackConfig) -> MotionState:
         """The state at a later time: the motion goes on, and what is known of it fades."""
         after_s = (t_us - self.t_us) * 1e-6
-        go_on = np.eye(12) + after_s * np.eye(12, k=6)
         return MotionState(
             t_us=t_us,
             T_world_camera=self.poses(np.array(after_s)),
             velocity=self.velocity,
-            covariance=go_on @ self.covariance @ go_on.T + _drift(after_s, config),
+            covariance=faded(self.covariance, after_s, config),
         )
+
+
+def faded(covariance: FloatArray, after_s: float, config: TrackConfig) -> FloatArray:
+    """(12, 12) covariance of a state after a time in which nothing was seen."""
+    go_on = np.eye(12) + after_s * np.eye(12, k=6)
+    return np.asarray(go_on @ covariance @ go_on.T + _drift(after_s, config))
 
 
 def _drift(after_s: float, config: TrackConfig) -> FloatArray:

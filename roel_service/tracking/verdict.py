@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from roel_service.arrays import FloatArray
 from roel_service.config.stages import TrackConfig
 from roel_service.scene.results import PoseStatus
 from roel_service.tracking.fit import WindowFit
@@ -42,8 +43,12 @@ class Verdict:
         self._unconvinced_count = 0
         self._contradicted_count = 0
 
-    def of(self, fit: WindowFit, config: TrackConfig) -> PoseStatus:
-        """The status of the next window's pose."""
+    def of(self, fit: WindowFit, cautious: FloatArray, config: TrackConfig) -> PoseStatus:
+        """The status of the next window's pose.
+
+        Args:
+            cautious: (12, 12) covariance of the state if no edge is relied on alone.
+        """
         self._count(fit, config)
         is_elsewhere = (
             self._contradicted_count > 0
@@ -55,7 +60,7 @@ class Verdict:
             or self._unconvinced_count >= PATIENCE_COUNT
         ):
             return PoseStatus.LOST
-        is_sure = self._convinced_count >= CONVINCED_COUNT and _is_known(fit, config)
+        is_sure = self._convinced_count >= CONVINCED_COUNT and _is_known(cautious, config)
         return PoseStatus.TRACKING if is_sure else PoseStatus.UNCERTAIN
 
     def _count(self, fit: WindowFit, config: TrackConfig) -> None:
@@ -71,8 +76,7 @@ class Verdict:
         self._contradicted_count = 0 if is_possible(fit, config) else self._contradicted_count + 1
 
 
-def _is_known(fit: WindowFit, config: TrackConfig) -> bool:
-    covariance = fit.state.covariance
+def _is_known(covariance: FloatArray, config: TrackConfig) -> bool:
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     shift = np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]
     return bool(turn <= np.deg2rad(config.max_sigma_deg) ** 2 and shift <= config.max_sigma_m**2)
