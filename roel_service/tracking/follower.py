@@ -10,7 +10,7 @@ from roel_service.arrays import FloatArray
 from roel_service.config.stages import TrackConfig
 from roel_service.scene.results import PoseStatus
 from roel_service.tracking.fit import Window, WindowFit, fit_window
-from roel_service.tracking.locate import EVENT_SCALES_PX, is_same_pose
+from roel_service.tracking.locate import EVENT_SCALES_PX, UNSURE_SCALES_PX, is_same_pose
 from roel_service.tracking.motion import MotionState, faded
 from roel_service.tracking.sight import Eyes
 from roel_service.tracking.verdict import Verdict, convinces
@@ -18,8 +18,6 @@ from roel_service.tracking.verdict import Verdict, convinces
 # A line that was seen so long ago is known to be in sight: it is not hidden, if it has no events.
 MEMORY_US = 300_000
 LONG_AGO_US = -(1 << 60)
-# Scales of the fit after a window that did not convince: its motion may lead astray.
-UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
 # What a window explained counts less in every later one.
 FADE = 0.8
 # Another answer that explains this share of what the best one does is a rival.
@@ -54,10 +52,11 @@ class Follower:
 
     def follow(self, window: Window, eyes: Eyes, config: TrackConfig) -> None:
         """Go on to the next window."""
-        forecast = self.state.foretold(window.t_us, config)
-        known = window.t_us - self._seen_us <= MEMORY_US
         after_s = (window.t_us - self.state.t_us) * 1e-6
-        scales_px = EVENT_SCALES_PX if convinces(self.fit, config) else UNSURE_SCALES_PX
+        is_unsure = not convinces(self.fit, config)
+        forecast = self.state.foretold(window.t_us, config)
+        scales_px = UNSURE_SCALES_PX if is_unsure else EVENT_SCALES_PX
+        known = window.t_us - self._seen_us <= MEMORY_US
         self.fit = fit_window(
             forecast, window, eyes.pieces, eyes.view, config, scales_px, known
         )

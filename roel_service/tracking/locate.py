@@ -21,7 +21,7 @@ from roel_service.mapping.plane_fit import FittedLines
 from roel_service.tracking import search_kernels
 from roel_service.tracking.fit import MIN_DEPTH_SHARE, View, Window, WindowFit, fit_window
 from roel_service.tracking.motion import MotionState
-from roel_service.tracking.sight import Eyes
+from roel_service.tracking.sight import Eyes, Sight
 from roel_service.tracking.pieces import equal_parts
 
 # Directions that are told apart, of half a turn.
@@ -44,14 +44,15 @@ POINT_PX, MOMENTS_S = 2.0, (-0.005, 0.0, 0.005)
 FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
 LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
+UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
-SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 120.0, 1.5
+SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0
 
 
 def locate(
     guess: SE3,
-    lines: FittedLines,
+    sight: Sight,
     window: Window,
     eyes: Eyes,
     config: TrackConfig,
@@ -61,24 +62,25 @@ def locate(
 
     Args:
         guess: rough `T_world_camera`.
-        lines: that are seen in the middle of the window, with their speeds.
+        sight: lines in the middle of the window, with their speeds, and the turn that they tell.
         window: the events of one interval.
         rng: draws the poses that are tried.
 
     Returns:
         Fits that lie apart, however poor; none where no line is seen.
     """
+    lines = sight.lines
     if len(lines.polarity) == 0:
         return []
     poses = _search(guess, lines, eyes, config, rng)
     sampled = _sampled(lines, window.t_us)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
-        for state in (_unmoved(pose, window.t_us, config) for pose in poses)
+        for state in (_turning(pose, sight.turn_rate, window.t_us, config) for pose in poses)
     ]
     best = distinct(sorted(fits, key=explained_count, reverse=True))
     on_events = [
-        fit_window(fit.state, window, eyes.pieces, eyes.view, config, EVENT_SCALES_PX)
+        fit_window(fit.state, window, eyes.pieces, eyes.view, config, UNSURE_SCALES_PX)
         for fit in best
     ]
     return distinct(sorted(on_events, key=explained_count, reverse=True))
@@ -105,8 +107,8 @@ def is_same_pose(one: MotionState, other: MotionState) -> bool:
     return bool(turn_rad < np.deg2rad(SAME_DEG) and shift_m < SAME_M)
 
 
-def _unmoved(pose: SE3, t_us: int, config: TrackConfig) -> MotionState:
-    """A pose of which little is known, and nothing of its motion."""
+def _turning(pose: SE3, turn_rate: FloatArray, t_us: int, config: TrackConfig) -> MotionState:
+    """A pose of which little is known, and of its motion what moves the picture as it does."""
     deviation = [
         *[POSE_SIGMA_SHARE * np.deg2rad(config.reach_deg)] * 3,
         *[POSE_SIGMA_SHARE * config.reach_m] * 3,
@@ -116,7 +118,7 @@ def _unmoved(pose: SE3, t_us: int, config: TrackConfig) -> MotionState:
     return MotionState(
         t_us=t_us,
         T_world_camera=pose,
-        velocity=np.zeros(6),
+        velocity=np.concatenate([pose.rotation @ turn_rate, np.zeros(3)]),
         covariance=np.diag(np.square(deviation)),
     )
 

@@ -154,7 +154,7 @@ class PoseTracker:
         turn_rate = state.T_world_camera.rotation.T @ state.velocity[:3]
         sight = look(buffer, window.t_us, self._eyes, turn_rate)
         place = state.T_world_camera
-        fits = locate(place, sight.lines, window, self._eyes, self._config, self._rng)
+        fits = locate(place, sight, window, self._eyes, self._config, self._rng)
         return [Follower(fit, before) for fit in fits if is_possible(fit, self._config)]
 
     def _found(self, window: Window, buffer: EventStream) -> TrackedPose:
@@ -166,7 +166,7 @@ class PoseTracker:
         if attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0:
             sight = look(buffer, window.t_us, self._eyes, turn_rate)
             place = self._whereabouts.place(window.t_us, attempt, self._rng)
-            fits = locate(place, sight.lines, window, self._eyes, self._config, self._rng)
+            fits = locate(place, sight, window, self._eyes, self._config, self._rng)
         self._whereabouts.turned(turn_rate, window.span_s)
         possible = [fit for fit in fits if is_possible(fit, self._config)]
         if not possible:
