@@ -344,7 +344,8 @@ def _add_silence(
     by_velocity = span_s * association.by_pose(state)[silent]
     motion_px = by_velocity @ state.velocity
     near = np.maximum(0.0, 1.0 - np.square(motion_px / (REACH * SILENT_PX)))
-    weight = np.square(near) / SILENT_PX**2
+    # They rest for one reason, and together say no more than one of them does.
+    weight = np.square(near) / (SILENT_PX**2 * max(1, len(near)))
     information[6:, 6:] += (weight[:, None] * by_velocity).T @ by_velocity
     slope[6:] += by_velocity.T @ (weight * motion_px)
 
