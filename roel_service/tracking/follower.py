@@ -61,13 +61,13 @@ class Follower:
             forecast, window, eyes.pieces, eyes.view, config, scales_px, known
         )
         self._seen_us[self.fit.seen] = window.t_us
-        self._cautious = _cautious(faded(self._cautious, after_s, config), self.fit)
+        self._cautious = cautious_covariance(faded(self._cautious, after_s, config), self.fit)
         self.status = self._verdict.of(self.fit, self._cautious, config)
         self.explained_count *= FADE
         self.explained_count += self.fit.evidence.explained_count
 
 
-def _cautious(forecast: FloatArray, fit: WindowFit) -> FloatArray:
+def cautious_covariance(forecast: FloatArray, fit: WindowFit) -> FloatArray:
     """(12, 12) covariance of the state if the edge that it needs most is not what it seems.
 
     Args:

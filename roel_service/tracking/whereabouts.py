@@ -50,13 +50,13 @@ class Whereabouts:
         lost_us = t_us if self._lost_us is None else self._lost_us
         coast_s = min(MAX_COAST_S, max(0, lost_us - self._last.t_us) * 1e-6)
         wander_s = min(MAX_WANDER_S, (t_us - lost_us) * 1e-6)
-        # First where the motion leads, then anywhere on the way there.
-        share = 1.0 if attempt == 0 else rng.uniform()
+        # First where the motion leads, then where it began, then anywhere on the way.
+        share = (1.0, 0.0)[attempt] if attempt < 2 else rng.uniform()
         place = self._last.poses(np.array(share * coast_s))
         turned = self._moved_on(place, rng.uniform(0.0, MAX_SHIFT_SHARE))
         deviation = _deviation(coast_s, COAST_SIGMA_DEG_S, COAST_SIGMA_M_S)
         deviation += _deviation(wander_s, WANDER_DEG_S, WANDER_M_S)
-        return turned.retract(rng.normal(size=6) * deviation * (attempt > 0))
+        return turned if attempt < 2 else turned.retract(rng.normal(size=6) * deviation)
 
     def _moved_on(self, place: SE3, shift_share: float) -> SE3:
         """A place after all turns that were seen, a share of which were shifts."""

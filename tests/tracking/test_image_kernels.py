@@ -132,3 +132,17 @@ class TestSupport:
         )
         assert (on[0], beside[0]) == (20, 1)
         assert occupied[0] == 0.5
+
+
+def test_what_edges_say_adds_up_to_what_all_events_say():
+    rng = np.random.default_rng(3)
+    by_pose, after_s, weight = rng.normal(size=(50, 6)), rng.normal(size=50), rng.uniform(size=50)
+    edge = rng.integers(0, 4, 50)
+    total, _ = image_kernels.normal_equations(np.zeros(50), by_pose, after_s, weight)
+    of_edges = image_kernels.information_by_edge(by_pose, after_s, weight, edge, 4)
+    np.testing.assert_allclose(of_edges.sum(axis=0), total, atol=1e-9)
+    first = edge == 2
+    of_one, _ = image_kernels.normal_equations(
+        np.zeros(first.sum()), by_pose[first], after_s[first], weight[first]
+    )
+    np.testing.assert_allclose(of_edges[2], of_one, atol=1e-9)

@@ -87,7 +87,8 @@ def test_chunks_of_any_size_give_the_same_poses(room, followed):
 
 def test_in_another_place_there_is_no_pose(room):
     elsewhere = LineMap.from_segments(walls(7))
-    poses = tracked(room, PoseTracker(elsewhere, CAMERA, CONFIG, room.pose(25_000)))
+    tracker = PoseTracker(elsewhere, CAMERA, CONFIG, room.pose(25_000))
+    poses = tracked(room, tracker, room.chunks()[:4])
     assert {pose.status for pose in poses} == {PoseStatus.LOST}
     assert all(pose.T_world_camera is None and pose.covariance is None for pose in poses)
 

@@ -34,13 +34,18 @@ def fit(share=0.9, sharpness=80.0, moving_px=1000.0, surprise=1.0, sigma_m=0.001
             in_view_px=1000.0,
             moving_px=moving_px,
             seen_px=share * moving_px,
+            moving_px2=5.0 * moving_px,
+            seen_px2=5.0 * share * moving_px,
             seen_count=40,
         ),
+        seen=np.ones(60, np.bool_),
+        information=np.eye(12),
+        information_of_edges=np.zeros((0, 12, 12)),
     )
 
 
 def statuses(verdict, *fits):
-    return [verdict.of(item, CONFIG) for item in fits]
+    return [verdict.of(item, item.state.covariance, CONFIG) for item in fits]
 
 
 @pytest.fixture
@@ -83,6 +88,11 @@ def test_a_camera_that_rests_keeps_what_was_said(convinced):
 def test_a_pose_that_few_lines_hold_is_uncertain(convinced):
     loose = fit(sigma_m=2.0 * CONFIG.max_sigma_m)
     assert statuses(convinced, loose, fit()) == [PoseStatus.UNCERTAIN, PoseStatus.TRACKING]
+
+
+def test_a_pose_that_one_edge_holds_is_uncertain(convinced):
+    without_it = (2.0 * CONFIG.max_sigma_m) ** 2 * np.eye(12)
+    assert convinced.of(fit(), without_it, CONFIG) is PoseStatus.UNCERTAIN
 
 
 def test_a_motion_that_does_not_go_on_costs_the_trust(convinced):
