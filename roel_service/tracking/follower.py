@@ -57,9 +57,7 @@ class Follower:
         forecast = self.state.foretold(window.t_us, config)
         scales_px = UNSURE_SCALES_PX if is_unsure else EVENT_SCALES_PX
         known = window.t_us - self._seen_us <= MEMORY_US
-        self.fit = fit_window(
-            forecast, window, eyes.pieces, eyes.view, config, scales_px, known
-        )
+        self.fit = fit_window(forecast, window, eyes.pieces, eyes.view, config, scales_px, known)
         self._seen_us[self.fit.seen] = window.t_us
         self._cautious = cautious_covariance(faded(self._cautious, after_s, config), self.fit)
         self.status = self._verdict.of(self.fit, self._cautious, config)

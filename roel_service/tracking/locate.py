@@ -21,8 +21,8 @@ from roel_service.mapping.plane_fit import FittedLines
 from roel_service.tracking import search_kernels
 from roel_service.tracking.fit import MIN_DEPTH_SHARE, View, Window, WindowFit, fit_window
 from roel_service.tracking.motion import MotionState
-from roel_service.tracking.sight import Eyes, Sight
 from roel_service.tracking.pieces import equal_parts
+from roel_service.tracking.sight import Eyes, Sight
 
 # Directions that are told apart, of half a turn.
 DIRECTION_COUNT = 12

@@ -77,9 +77,7 @@ def _edges(lines: FloatArray, direction: FloatArray, reach_m: float) -> IntArray
     """(L,) edge of each line: lines of about one direction whose middles pass each other closely."""
     middle = segments.midpoint(lines)
     is_along = np.abs(direction @ direction.T) > np.cos(np.deg2rad(EDGE_DEG))
-    across_m = np.linalg.norm(
-        np.cross(middle[:, None] - middle[None], direction[None]), axis=-1
-    )
+    across_m = np.linalg.norm(np.cross(middle[:, None] - middle[None], direction[None]), axis=-1)
     _, edge = connected_components(is_along & (across_m < reach_m), directed=True)
     return np.asarray(edge, np.int64)
 

@@ -110,16 +110,16 @@ def _turn_rate(lines: FittedLines, view: View) -> FloatArray:
     by_turn = _speeds_by_turn(lines.segments_px, view)
     speed_px_s = 1e3 * lines.normal_speed_px_per_ms
     length_px = segments.length(lines.segments_px)
-    prior = np.eye(3) / TURN_SIGMA_RAD_S**2
-    weight = length_px / max(float(length_px.mean()), 1.0) if len(length_px) else length_px
+    certainty = length_px / (
+        max(1.0, float(length_px.sum()) / max(1, len(length_px))) * SPEED_NOISE_PX_S**2
+    )
     turn_rate = np.zeros(3)
-    robust = np.ones(len(length_px))
     for _ in range(ROBUST_STEP_COUNT):
-        rows = (weight * robust / SPEED_NOISE_PX_S**2)[:, None] * by_turn
-        turn_rate = np.linalg.solve(rows.T @ by_turn + prior, rows.T @ speed_px_s)
-        residual = (by_turn @ turn_rate - speed_px_s) / SPEED_NOISE_PX_S
-        robust = 1.0 / (1.0 + np.square(residual))
-    return np.asarray(turn_rate)
+        off = (by_turn @ turn_rate - speed_px_s) / SPEED_NOISE_PX_S
+        rows = (certainty / (1.0 + np.square(off)))[:, None] * by_turn
+        information = rows.T @ by_turn + np.eye(3) / TURN_SIGMA_RAD_S**2
+        turn_rate[:] = np.linalg.solve(information, rows.T @ speed_px_s)
+    return turn_rate
 
 
 def _speeds_by_turn(segments_px: FloatArray, view: View) -> FloatArray:

@@ -30,10 +30,14 @@ FINDING_AT_ONCE, FINDING_STRIDE = 4, 7
 # Without events for so long, the camera may be anywhere within reach.
 MAX_SILENCE_US = 500_000
 
+
 class PoseTracker:
     """Follows a camera: events in, one pose for each interval out.
 
     Memory holds the map, one interval of events and the last chunk that came.
+
+    Where several answers explain what is seen about equally well, all are followed, and the best
+    one is told as `UNCERTAIN`. While none convinces, others are looked for beside them.
 
     Args:
         line_map: where the camera is.
@@ -60,13 +64,13 @@ class PoseTracker:
         self._buffer: EventStream | None = None
         self._next_us = 0
         self._followers: list[Follower] = []
+        # Windows since the camera was lost, and since it was known well.
+        self._lost_count = self._unsure_count = 0
         self.guess(guess)
 
     def guess(self, T_world_camera: SE3) -> None:
         """Give up what is known, and look around another pose."""
-        self._whereabouts = Whereabouts(
-            T_world_camera, self._next_us, self._eyes.pieces.extent_m
-        )
+        self._whereabouts = Whereabouts(T_world_camera, self._eyes.pieces.extent_m)
         self._lose()
 
     def push(self, events: EventStream) -> list[TrackedPose]:
@@ -122,12 +126,13 @@ class PoseTracker:
         start, stop = np.searchsorted(buffer.t_us, span_us)
         events = buffer.slice(int(start), int(stop), self._next_us)
         window = window_of(events, self._eyes.ideal_px, span_us, self._config.max_event_count)
+        around = _between(buffer, self._next_us - FINDING_HALF_US, self._next_us + self._reach_us())
         self._next_us += self._config.interval_us
         if self._followers:
-            return self._followed(window, buffer)
-        return self._found(window, buffer)
+            return self._followed(window, around)
+        return self._found(window, around)
 
-    def _followed(self, window: Window, buffer: EventStream) -> TrackedPose:
+    def _followed(self, window: Window, around: EventStream) -> TrackedPose:
         for follower in self._followers:
             follower.follow(window, self._eyes, self._config)
         best = max(self._followers, key=lambda each: each.explained_count)
@@ -136,7 +141,7 @@ class PoseTracker:
             self._lose()
             return _lost(window, best.fit)
         if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1:
-            alive += self._second_opinions(window, buffer, best)
+            alive += self._second_opinions(window, around, best)
         best, *others = self._followers = rivals(alive)
         status = PoseStatus.UNCERTAIN if others else best.status
         if status is PoseStatus.TRACKING:
@@ -147,24 +152,27 @@ class PoseTracker:
         return _told(window, status, best.fit)
 
     def _second_opinions(
-        self, window: Window, buffer: EventStream, best: Follower
+        self, window: Window, around: EventStream, best: Follower
     ) -> list[Follower]:
         """Other answers near one that does not convince, as if they had been followed so far."""
-        state, before = best.state, best.explained_count / best.fit.evidence.explained_count
-        turn_rate = state.T_world_camera.rotation.T @ state.velocity[:3]
-        sight = look(buffer, window.t_us, self._eyes, turn_rate)
-        place = state.T_world_camera
+        evidence, place = best.fit.evidence, best.state.T_world_camera
+        if evidence.is_still or evidence.explained_count == 0.0:
+            # There is nothing to be explained.
+            return []
+        before = best.explained_count / evidence.explained_count
+        turn_rate = place.rotation.T @ best.state.velocity[:3]
+        sight = look(around, window.t_us, self._eyes, turn_rate)
         fits = locate(place, sight, window, self._eyes, self._config, self._rng)
         return [Follower(fit, before) for fit in fits if is_possible(fit, self._config)]
 
-    def _found(self, window: Window, buffer: EventStream) -> TrackedPose:
+    def _found(self, window: Window, around: EventStream) -> TrackedPose:
         """Look for the camera, now and then; see how it turns, all the time."""
         self._whereabouts.lost(window.t_us)
-        turn_rate = glimpse(buffer, window.t_us, self._eyes).turn_rate
+        turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
         attempt, self._lost_count = self._lost_count, self._lost_count + 1
         fits: list[WindowFit] = []
         if attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0:
-            sight = look(buffer, window.t_us, self._eyes, turn_rate)
+            sight = look(around, window.t_us, self._eyes, turn_rate)
             place = self._whereabouts.place(window.t_us, attempt, self._rng)
             fits = locate(place, sight, window, self._eyes, self._config, self._rng)
         self._whereabouts.turned(turn_rate, window.span_s)
@@ -177,6 +185,11 @@ class PoseTracker:
     def _lose(self) -> None:
         self._followers = []
         self._lost_count = self._unsure_count = 0
+
+
+def _between(events: EventStream, first_us: int, last_us: int) -> EventStream:
+    first, last = np.searchsorted(events.t_us, [first_us, last_us])
+    return events.part(int(first), int(last))
 
 
 def _told(window: Window, status: PoseStatus, fit: WindowFit) -> TrackedPose:

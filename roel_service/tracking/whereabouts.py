@@ -22,17 +22,25 @@ MAX_TURN_COUNT = 200
 
 
 class Whereabouts:
-    """The last place that could be relied on, and what was seen of the motion since."""
+    """The last place that could be relied on, and what was seen of the motion since.
 
-    def __init__(self, T_world_camera: SE3, t_us: int, extent_m: float) -> None:
+    Args:
+        T_world_camera: where the camera is when it is first looked for, roughly.
+        extent_m: of the map.
+    """
+
+    def __init__(self, T_world_camera: SE3, extent_m: float) -> None:
+        self._place = T_world_camera
         self._depth_m = DEPTH_SHARE * extent_m
-        self.relied_on(_at_rest(T_world_camera, t_us))
+        self._last: MotionState | None = None
+        self._lost_us: int | None = None
+        self._turns: list[FloatArray] = []
 
     def relied_on(self, state: MotionState) -> None:
         """The camera is here."""
-        self._last = state
-        self._lost_us: int | None = None
-        self._turns: list[FloatArray] = []
+        self._last, self._place = state, state.T_world_camera
+        self._lost_us = None
+        self._turns = []
 
     def lost(self, t_us: int) -> None:
         """It is out of sight from now on, unless it was so before."""
@@ -48,11 +56,13 @@ class Whereabouts:
     def place(self, t_us: int, attempt: int, rng: np.random.Generator) -> SE3:
         """A place to look at, another one at each attempt."""
         lost_us = t_us if self._lost_us is None else self._lost_us
-        coast_s = min(MAX_COAST_S, max(0, lost_us - self._last.t_us) * 1e-6)
         wander_s = min(MAX_WANDER_S, (t_us - lost_us) * 1e-6)
-        # First where the motion leads, then where it began, then anywhere on the way.
-        share = (1.0, 0.0)[attempt] if attempt < 2 else rng.uniform()
-        place = self._last.poses(np.array(share * coast_s))
+        coast_s, place = 0.0, self._place
+        if self._last is not None:
+            coast_s = min(MAX_COAST_S, max(0, lost_us - self._last.t_us) * 1e-6)
+            # First where the motion leads, then where it began, then anywhere on the way.
+            share = (1.0, 0.0)[attempt] if attempt < 2 else rng.uniform()
+            place = self._last.poses(np.array(share * coast_s))
         turned = self._moved_on(place, rng.uniform(0.0, MAX_SHIFT_SHARE))
         deviation = _deviation(coast_s, COAST_SIGMA_DEG_S, COAST_SIGMA_M_S)
         deviation += _deviation(wander_s, WANDER_DEG_S, WANDER_M_S)
@@ -71,12 +81,3 @@ class Whereabouts:
 def _deviation(after_s: float, turn_deg_s: float, shift_m_s: float) -> FloatArray:
     """(6,) of a pose step, after a time."""
     return after_s * np.array([np.deg2rad(turn_deg_s)] * 3 + [shift_m_s] * 3)
-
-
-def _at_rest(T_world_camera: SE3, t_us: int) -> MotionState:
-    return MotionState(
-        t_us=t_us,
-        T_world_camera=T_world_camera,
-        velocity=np.zeros(6),
-        covariance=np.zeros((12, 12)),
-    )

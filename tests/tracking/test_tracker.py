@@ -85,6 +85,26 @@ def test_chunks_of_any_size_give_the_same_poses(room, followed):
         )
 
 
+def test_a_camera_at_rest_keeps_its_pose(halfway):
+    tracker, _, rest = halfway
+    first_us = int(rest.t_us[0])
+    # Some noise, and no motion.
+    rng = np.random.default_rng(2)
+    t_us = np.sort(rng.integers(first_us + 20_000, first_us + 500_000, 400))
+    events = EventStream(
+        t_us=np.concatenate([rest.t_us[rest.t_us < first_us + 20_000], t_us]),
+        x=np.concatenate([rest.x[rest.t_us < first_us + 20_000], rng.integers(0, 240, 400)]),
+        y=np.concatenate([rest.y[rest.t_us < first_us + 20_000], rng.integers(0, 180, 400)]),
+        polarity=np.ones(400 + int((rest.t_us < first_us + 20_000).sum()), np.int8),
+        width=CAMERA.width,
+        height=CAMERA.height,
+    )
+    after = tracker.push(events)
+    assert PoseStatus.LOST not in {each.status for each in after}
+    stays = after[-1].T_world_camera.local(after[-8].T_world_camera)
+    assert np.abs(stays).max() < 0.005
+
+
 def test_in_another_place_there_is_no_pose(room):
     elsewhere = LineMap.from_segments(walls(7))
     tracker = PoseTracker(elsewhere, CAMERA, CONFIG, room.pose(25_000))

@@ -29,13 +29,21 @@ def places(whereabouts, t_us, count=200):
 
 
 def test_a_camera_that_was_just_lost_is_looked_for_where_it_was():
-    whereabouts = Whereabouts(HERE, 0, extent_m=6.0)
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
     whereabouts.lost(0)
     assert far(whereabouts.place(0, 0, np.random.default_rng(0)), HERE) == pytest.approx((0.0, 0.0))
 
 
+def test_a_first_pose_is_that_of_the_first_events_whatever_their_clock_says():
+    first_us = 1_700_000_000_000_000
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
+    whereabouts.lost(first_us)
+    for place in places(whereabouts, first_us, 20):
+        assert far(place, HERE) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
 def test_without_events_its_motion_goes_on_for_a_while():
-    whereabouts = Whereabouts(HERE, 0, extent_m=6.0)
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
     whereabouts.relied_on(moving([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
     whereabouts.lost(10_000_000)
     place = whereabouts.place(10_000_000, 0, np.random.default_rng(0))
@@ -45,7 +53,7 @@ def test_without_events_its_motion_goes_on_for_a_while():
 
 
 def test_turns_that_are_seen_are_followed_as_turns_or_as_shifts():
-    whereabouts = Whereabouts(HERE, 0, extent_m=6.0)
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
     whereabouts.lost(0)
     turn_rate = np.array([0.0, 1.0, 0.0])
     for _ in range(12):
@@ -67,14 +75,14 @@ def test_turns_that_are_seen_are_followed_as_turns_or_as_shifts():
 
 
 def test_turns_count_only_while_it_is_lost():
-    whereabouts = Whereabouts(HERE, 0, extent_m=6.0)
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
     whereabouts.turned(np.array([0.0, 1.0, 0.0]), 1.0)
     whereabouts.lost(0)
     assert far(whereabouts.place(0, 0, np.random.default_rng(0)), HERE) == pytest.approx((0.0, 0.0))
 
 
 def test_the_longer_it_is_lost_the_farther_around_is_looked():
-    whereabouts = Whereabouts(HERE, 0, extent_m=6.0)
+    whereabouts = Whereabouts(HERE, extent_m=6.0)
     whereabouts.lost(0)
     soon, late = (
         np.array([far(place, HERE) for place in places(whereabouts, t_us)[2:]]).mean(axis=0)
