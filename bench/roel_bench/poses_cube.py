@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from roel_bench.peers import limap_poses
 from roel_bench.scenes import Scene
 from roel_service.config.presets import preset
 from roel_service.config.stages import Config, RefineConfig
@@ -51,6 +52,8 @@ METHODS: dict[str, RefineConfig | None] = {
     "line Grassmann, quartic": replace(PAPER, event_weight=0.0, loss="quartic"),
     "line + event Grassmann, quartic": replace(PAPER, loss="quartic"),
 }
+# LIMAP's own bundle adjustment on the same tracks, where its environment is.
+LIMAP_ITSELF = "LIMAP bundle adjustment"
 # The default's rows: with the map of true poses, and from events and noisy poses alone.
 IN_A_MAP, ALONE = "default, in the map", "default"
 
@@ -65,7 +68,7 @@ class CubeRow:
         ate_hundredths, sim3_hundredths: of a unit, after SE(3) and after Sim(3) alignment.
         scale: of that alignment.
         rotation_deg: root mean square.
-        seconds: processor time.
+        seconds: processor time; by the clock where LIMAP's process did the work.
     """
 
     method: str
@@ -95,6 +98,11 @@ def cube_rows(scene: Scene, seeds: Iterable[int]) -> Iterator[CubeRow]:
             poses = noisy if config is None else _batch(detected, refined, noisy, config)
             seconds = time.process_time() - began
             yield _row(method, seed, detected, poses, len(refined), seconds, scene.trajectory)
+        if limap_poses.is_installed():
+            began = time.perf_counter()
+            poses = limap_poses.adjusted_poses(refined, _moved(detected, noisy))
+            seconds = time.perf_counter() - began
+            yield _row(LIMAP_ITSELF, seed, detected, poses, len(refined), seconds, scene.trajectory)
         given = Trajectory(t_us=detected.frames.t_us, T_world_camera=noisy)
         for method, line_map in ((IN_A_MAP, true_map), (ALONE, None)):
             began = time.process_time()
@@ -143,11 +151,15 @@ def triangulated(scene: Scene, trajectory: Trajectory) -> tuple[Detected, Refine
 
 
 def _batch(detected: Detected, refined: Refined, noisy: SE3, config: RefineConfig) -> SE3:
-    frames = replace(detected.frames, T_world_camera=noisy)
-    views = views_of(detected.observations, frames)
-    moved = replace(detected, frames=frames, evidence=replace(detected.evidence, views=views))
     config = replace(config, pose_iteration_count=STEP_COUNT)
-    return refine_batch(refined, moved, config).T_world_camera
+    return refine_batch(refined, _moved(detected, noisy), config).T_world_camera
+
+
+def _moved(detected: Detected, poses: SE3) -> Detected:
+    """What was seen, by frames with other poses."""
+    frames = replace(detected.frames, T_world_camera=poses)
+    views = views_of(detected.observations, frames)
+    return replace(detected, frames=frames, evidence=replace(detected.evidence, views=views))
 
 
 def _row(

@@ -1,0 +1,101 @@
+"""LIMAP's side of `limap_poses.py`: lines, their tracks and poses in, bundle-adjusted poses out.
+
+    python limap_poses_worker.py INPUT.npz OUTPUT.npz
+
+Runs in LIMAP's own environment and therefore imports nothing of this project. The arrays of the
+input are those of `limap_poses.write_problem`.
+"""
+
+from __future__ import annotations
+
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from limap import geometry, scene
+from limap.estimators import bundle_adjustment
+
+CAMERA_ID, FIRST_IMAGE_ID = 1, 1
+
+
+def main(input_path: Path, output_path: Path) -> None:
+    """Adjust lines and all poses but the first."""
+    with np.load(input_path) as file:
+        problem = dict(file)
+    holistic = scene.HolisticReconstruction(posed_images(problem))
+    add_lines(holistic, problem)
+    adjust(holistic, int(problem["iteration_count"]))
+    images = holistic.point_recon.images
+    poses = [images[k].cam_from_world().matrix() for k in sorted(images)]
+    np.savez(output_path, T_camera_world=np.array(poses))
+
+
+def posed_images(problem: dict[str, Any]) -> pycolmap.Reconstruction:
+    """A COLMAP model of one pinhole camera and its poses, without points."""
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        camera_id=CAMERA_ID,
+        model="PINHOLE",
+        width=int(problem["width"]),
+        height=int(problem["height"]),
+        params=problem["pinhole_px"],
+    )
+    reconstruction.add_camera_with_trivial_rig(camera)
+    poses = zip(problem["R_camera_world"], problem["t_camera_world"], strict=True)
+    for image_id, (rotation, translation) in enumerate(poses, start=FIRST_IMAGE_ID):
+        image = pycolmap.Image(name=f"{image_id}.png", camera_id=CAMERA_ID, image_id=image_id)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    return reconstruction
+
+
+def add_lines(holistic: scene.HolisticReconstruction, problem: dict[str, Any]) -> None:
+    """The 2D lines of every image, and the 3D lines with their observations."""
+    structures = holistic.structure_recon
+    for image_id, (first, last) in enumerate(pairwise(problem["line_offsets"]), FIRST_IMAGE_ID):
+        lines = geometry.get_line2d_vector_from_array(
+            problem["segments_px"][first:last].reshape(-1, 4)
+        )
+        structure = scene.Structure2d()
+        structure.set_lines(lines)
+        structures.add_structure2d(image_id, structure)
+    observations = problem["observations"]
+    for segment, (first, last) in zip(
+        problem["segments"], pairwise(problem["track_offsets"]), strict=True
+    ):
+        line_id = structures.add_line3D(geometry.Line3d(segment))
+        for frame, local in observations[first:last].tolist():
+            element = pycolmap.TrackElement(FIRST_IMAGE_ID + frame, local)
+            structures.add_line_observation(line_id, element)
+
+
+def adjust(holistic: scene.HolisticReconstruction, iteration_count: int) -> None:
+    """LIMAP's bundle adjustment with its own loss; the first pose is held."""
+    config = bundle_adjustment.PointLineBundleAdjustmentConfig()
+    images = holistic.point_recon.images
+    for image_id in images:
+        config.add_image(image_id)
+    config.set_constant_rig_from_world_pose(images[FIRST_IMAGE_ID].frame_id)
+    for line_id in holistic.structure_recon.lines3D:
+        config.add_variable_line(line_id)
+    options = bundle_adjustment.PointLineBundleAdjustmentOptions()
+    for name in (
+        "refine_points",
+        "refine_points3D",
+        "refine_focal_length",
+        "refine_principal_point",
+        "refine_extra_params",
+        "refine_sensor_from_rig",
+        "print_summary",
+    ):
+        setattr(options, name, False)
+    options.refine_rig_from_world = True
+    options.ceres.solver_options.max_num_iterations = iteration_count
+    bundle_adjustment.create_point_line_bundle_adjuster(options, config, holistic).solve()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
