@@ -34,7 +34,8 @@ translation, means over the draws of noise; Sim(3) also takes the scale out, whi
 given path. The paper's own figures are 33.25 (none), 32.05 (LIMAP's reprojection), 27.95 (line
 Grassmann) and 6.92 (line and event Grassmann). All rows but the last ones refine the same tracks with this
 project's solver, `LIMAP bundle adjustment` with LIMAP's own (pylimap, seconds by the clock).
-`default, in the map` looks for the noisy poses in the map that the default builds with true ones, which is as much as the rows above are given; `default` gets the events and the noisy poses alone.
+`default, in the map` looks for the noisy poses in the map that the default builds with true ones, which is
+as much as the rows above are given; `default` gets the events and the noisy poses alone.
 """
 
 ROOMS = """\
