@@ -156,6 +156,8 @@ def config_digest(config: Config) -> str:
         del tables["curves"]
     if config.match_global.method != "reassociate" or not config.match_global.one_side:
         del tables["match_global"]["one_side"]
+    if config.trim.method != "coverage":
+        del tables["trim"]["max_foreshortening"]
     is_on = {"pose_": config.refine.free_poses, "corner_": config.refine.corner_sigma_m > 0}
     off = tuple(prefix for prefix in is_on if not is_on[prefix])
     if config.trim.max_error_m == UNLIMITED:

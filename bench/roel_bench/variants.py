@@ -93,6 +93,7 @@ DEFAULT_ABLATION = (
     _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
     _without("refinement", **_refined(NO_STEPS)),
     _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
+    _without("end-on views left out", trim={"max_foreshortening": UNLIMITED}),
     _without("filter by the expected error", trim={"max_error_m": UNLIMITED}),
 )
 

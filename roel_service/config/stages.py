@@ -409,6 +409,8 @@ class TrimConfig(Stage, table="trim"):
         min_pixel_gap_px: gaps below this many pixels at the viewing distance are bridged too.
         min_coverage_count, min_coverage_fraction: frames that must have seen a bin, absolute and
             against the best bin.
+        max_foreshortening: views in which a line looks this many times shorter than it is, nearly
+            end on, do not count (`coverage`).
         end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
         max_error_m: largest error to expect of an end across the line: its standard deviation for
             the line's own residual, over the support ratio.
@@ -426,6 +428,7 @@ class TrimConfig(Stage, table="trim"):
     min_pixel_gap_px: float = parameter(3.0, NOT_NEGATIVE)
     min_coverage_count: int = parameter(4, POSITIVE)
     min_coverage_fraction: float = parameter(0.25, SHARE)
+    max_foreshortening: float = parameter(5.0, Rule(">= 1", lambda value: value >= 1))
     end_cluster_px: float = parameter(5.0, POSITIVE)
     max_error_m: float = parameter(0.06, POSITIVE)
     max_sigma_m: float = parameter(UNLIMITED, POSITIVE)

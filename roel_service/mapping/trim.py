@@ -187,6 +187,7 @@ def _covered(
     refined: Refined, cuts: _Cuts, views: Views, frames: Frames, config: TrimConfig
 ) -> _Segments:
     """Runs that enough observations cover; short gaps are bridged, long ones part the line."""
+    cuts = _not_end_on(cuts, refined.tracks, views, frames, config.max_foreshortening)
     line_of = refined.tracks.track_of_row[cuts.row]
     frame_of = views.frame[refined.tracks.observation[cuts.row]]
     lines, intervals, counts = [], [], []
@@ -203,6 +204,17 @@ def _covered(
             intervals.append((start_m, stop_m))
             counts.append(len(np.unique(frame_of[rows][overlaps])))
     return _segments(lines, intervals, counts)
+
+
+def _not_end_on(
+    cuts: _Cuts, tracks: LineTracks, views: Views, frames: Frames, max_foreshortening: float
+) -> _Cuts:
+    """The cuts without those of views along the line, where a pixel is a long way on it."""
+    length_px = views.length_px[tracks.observation[cuts.row]]
+    across_m = length_px * cuts.depth_m / frames.focal_px
+    along_m = cuts.interval_m[:, 1] - cuts.interval_m[:, 0]
+    kept = along_m <= max_foreshortening * across_m
+    return _Cuts(interval_m=cuts.interval_m[kept], depth_m=cuts.depth_m[kept], row=cuts.row[kept])
 
 
 def _runs(ends: FloatArray, covered: BoolArray, max_gap_m: float) -> list[tuple[float, float]]:

@@ -54,6 +54,8 @@ def values_of(path, value):
         return st.lists(st.integers(1, 10**6)).map(tuple)
     if path == "match_global.checkpoint":
         return st.text().filter(str.isprintable)
+    if path == "trim.max_foreshortening":
+        return st.floats(1.0, 100.0)
     if isinstance(value, bool):
         return st.booleans()
     if isinstance(value, tuple):

@@ -101,6 +101,23 @@ class TestEnds:
         assert found[12.0] <= found[1.0] + 1e-9
 
 
+class TestEndOn:
+    """An edge 2 m long that leads away from the camera, within 9 degrees of its viewing rays."""
+
+    EDGE = np.array([[[0.35, 0.1, 1.0], [0.35, 0.1, 3.0]]])
+
+    @pytest.mark.parametrize(("max_foreshortening", "count"), [(5.0, 0), (50.0, 1)])
+    def test_views_along_a_line_do_not_count(self, max_foreshortening, count):
+        config = dataclasses.replace(OPEN, max_foreshortening=max_foreshortening)
+        line_map, _ = trimmed(world_of(self.EDGE), config)
+        assert len(line_map) == count
+
+    def test_lines_seen_from_the_side_keep_their_ends(self):
+        exact = world()
+        line_map, _ = trimmed(exact, dataclasses.replace(OPEN, max_foreshortening=5.0))
+        assert_same_segments(line_map.segments, exact.segments, atol=1e-9)
+
+
 class TestPieces:
     """An edge 1 m long that is seen without its middle 20 cm."""
 
