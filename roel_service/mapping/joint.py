@@ -10,17 +10,20 @@ How far the given poses may be off is learned on the way (`Drift.estimated`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from scipy import linalg, sparse
 
-from roel_service.arrays import FloatArray
+from roel_service.arrays import FloatArray, IntArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker, projection
 from roel_service.geometry.se3 import SE3, rotation_vector_jacobian
 from roel_service.geometry.vectors import norm
+from roel_service.in_order import in_order
 from roel_service.mapping import joint_kernels
 from roel_service.mapping.front_end import Detected
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
@@ -39,14 +42,18 @@ from roel_service.mapping.refine import (
 )
 from roel_service.scene.lines import InfiniteLines
 
+Result = TypeVar("Result")
+
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 6
 # An estimated drift is at least this share of the configured one.
 LEAST_DRIFT_SHARE = 0.01
 # A step that lowers the cost by less than this share ends the iteration.
 CONVERGED_SHARE = 1e-4
-# Doubles of the blocks that are in memory at a time while lines are eliminated: 64 MiB.
-BLOCK_SIZE = 2**23
+# Lines are worked on in so many parts, each in a thread, as long as what they take from the control
+# points' equations has at most so many elements in all: 64 MiB.
+PART_COUNT = 4
+MAX_ELEMENT_COUNT = 2**23
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -90,7 +97,7 @@ class _System:
         observation_cost: of the observations alone.
         line_gradient, line_hessian: (L, 4) and (L, 4, 4).
         control_gradient, control_hessian: (6 K,) and (6 K, 6 K).
-        rows: (S, 4, 6) by line and pose.
+        rows: (S, 4, 6) by the line and the tangent of the pose.
     """
 
     cost: float
@@ -125,6 +132,7 @@ def refine_jointly(
     directions: DirectionPrior | None,
     *,
     free_lines: bool = True,
+    worker_count: int = 1,
 ) -> JointlyRefined:
     """Refine lines and the correction of the poses over the lines' observations.
 
@@ -136,8 +144,17 @@ def refine_jointly(
         config: loss, gates, noise of an observation, drift of the poses and number of steps.
         directions: that lines are held to.
         free_lines: whether the lines move too.
+        worker_count: threads.
     """
-    problem = _Problem(refined, correction, detected, config, directions, free_lines=free_lines)
+    problem = _Problem(
+        refined,
+        correction,
+        detected,
+        config,
+        directions,
+        free_lines=free_lines,
+        worker_count=worker_count,
+    )
     state = problem.first_state(refined.lines, correction, drift)
     damping = FIRST_DAMPING
     costs: list[float] = []
@@ -182,6 +199,30 @@ def _believed(prior: DirectionPrior, lines: InfiniteLines, config: RefineConfig)
     return replace(prior, weight=prior.weight / (1.0 + (sine / scale) ** 2) ** 2)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Part:
+    """Some lines that follow each other, with their rows; the offsets are within these."""
+
+    lines: slice
+    rows: slice
+    offsets: IntArray
+
+
+def _parts(offsets: IntArray, count: int) -> list[_Part]:
+    """All lines in at most so many parts of about as many rows each; at least one part."""
+    ends_rows = np.linspace(0, offsets[-1], count + 1)[1:-1]
+    ends = np.unique([0, *np.searchsorted(offsets[:-1], ends_rows), len(offsets) - 1])
+    bounds = ends.tolist() if len(ends) > 1 else [0, 0]
+    return [
+        _Part(
+            lines=slice(first, last),
+            rows=slice(int(offsets[first]), int(offsets[last])),
+            offsets=offsets[first : last + 1] - offsets[first],
+        )
+        for first, last in pairwise(bounds)
+    ]
+
+
 class _Problem:
     """The observations of all lines in one list, each row with its line and frame."""
 
@@ -194,10 +235,12 @@ class _Problem:
         directions: DirectionPrior | None,
         *,
         free_lines: bool,
+        worker_count: int = 1,
     ) -> None:
         frames, evidence = detected.frames, detected.evidence
         self.config = config
         self.free_lines = free_lines
+        self.worker_count = worker_count
         self.frames = frames
         self.end_rays = projection.ray_from_pixel(detected.observations.segments_px, frames.K)
         self.frame_of = evidence.views.frame
@@ -215,6 +258,8 @@ class _Problem:
         self.length_weight = np.minimum(length_px, most_px) / most_px
         self.first_control, self.basis = correction.basis(frames.t_us)
         self.shares = correction.shares(frames.t_us)
+        most = MAX_ELEMENT_COUNT // (6 * len(correction)) ** 2
+        self.parts = _parts(self.offsets, max(1, min(PART_COUNT, most)))
 
     def first_state(self, lines: InfiniteLines, correction: PoseCorrection, drift: Drift) -> _State:
         moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
@@ -239,18 +284,22 @@ class _Problem:
         """(S,) weights of iterated reweighting, 0 for outliers."""
         v, m = state.lines.plucker
         poses = self.moved_poses(state)
-        residual_px = joint_kernels.end_residuals(
-            self.offsets,
-            self.origin,
-            v,
-            m,
-            poses.rotation,
-            poses.translation,
-            self.frame_of,
-            self.observation,
-            self.end_rays,
-            self.frames.focal_px,
-        )
+
+        def residuals_of(part: _Part) -> FloatArray:
+            return joint_kernels.end_residuals(
+                part.offsets,
+                self.origin[part.lines],
+                v[part.lines],
+                m[part.lines],
+                poses.rotation,
+                poses.translation,
+                self.frame_of,
+                self.observation[part.rows],
+                self.end_rays,
+                self.frames.focal_px,
+            )
+
+        residual_px = np.concatenate(self._of_parts(residuals_of))
         gate_px = self.config.max_residual_px * (FIRST_GATE if loose else 1.0)
         robust = 1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2)
         return np.asarray(
@@ -260,18 +309,22 @@ class _Problem:
     def line_costs(self, lines: OrthonormalLines, poses: SE3, weight: FloatArray) -> FloatArray:
         """(L,) of observations and directions, with fixed (S,) weights."""
         v, m = lines.plucker
-        cost = joint_kernels.joint_cost(
-            self.offsets,
-            self.origin,
-            v,
-            m,
-            poses.rotation,
-            poses.translation,
-            self.frame_of,
-            self.observation,
-            self.forms,
-            weight,
-        )
+
+        def costs_of(part: _Part) -> FloatArray:
+            return joint_kernels.joint_cost(
+                part.offsets,
+                self.origin[part.lines],
+                v[part.lines],
+                m[part.lines],
+                poses.rotation,
+                poses.translation,
+                self.frame_of,
+                self.observation[part.rows],
+                self.forms,
+                weight[part.rows],
+            )
+
+        cost = np.concatenate(self._of_parts(costs_of))
         if self.directions is not None:
             cost = cost + self.precision * direction_system(lines, self.directions).cost
         return np.asarray(cost)
@@ -282,32 +335,13 @@ class _Problem:
 
     def system(self, state: _State, weight: FloatArray) -> _System:
         """Normal equations with fixed (S,) weights."""
-        v, m = state.lines.plucker
-        dv, dm = plucker.plucker_jacobians(state.lines.U, state.lines.phi)
-        poses = self.moved_poses(state)
-        cost, by_line, by_lines, by_pose, by_poses, rows = joint_kernels.joint_system(
-            self.offsets,
-            self.origin,
-            v,
-            m,
-            np.concatenate([dv, dm], axis=-2),
-            poses.rotation,
-            poses.translation,
-            self.frame_of,
-            self.observation,
-            self.forms,
-            weight,
-        )
+        cost, by_line, by_lines, by_pose, by_poses, rows = self._by_tangents(state, weight)
         observation_cost = float(cost.sum())
         if self.directions is not None:
             held = direction_system(state.lines, self.directions)
             cost = cost + self.precision * held.cost
             by_line = by_line + self.precision * held.gradient
             by_lines = by_lines + self.precision * held.hessian
-        by_tangent = self._pose_by_tangent(state)
-        by_pose = np.einsum("nij,ni->nj", by_tangent, by_pose)
-        by_poses = np.swapaxes(by_tangent, -1, -2) @ by_poses @ by_tangent
-        rows = rows @ by_tangent[self.frame_of[self.observation]]
         # Of the control points; a frame depends on four of them, so nothing large is dense.
         control_by_frame = sparse.kron(self.shares, np.eye(6), format="csr")
         frame_count = len(by_poses)
@@ -324,12 +358,43 @@ class _Problem:
             rows=rows,
         )
 
-    def _pose_by_tangent(self, state: _State) -> FloatArray:
-        """(N, 6, 6) how a pose steps (r, d) when its correction's tangent changes."""
+    def _by_tangents(self, state: _State, weight: FloatArray) -> tuple[FloatArray, ...]:
+        """What `joint_system` finds, by the tangents of the poses."""
+        v, m = state.lines.plucker
+        jacobian = np.concatenate(
+            plucker.plucker_jacobians(state.lines.U, state.lines.phi), axis=-2
+        )
+        poses = self.moved_poses(state)
         tangent = self.shares @ state.correction.control
-        derivative = np.tile(np.eye(6), (len(tangent), 1, 1))
-        derivative[:, :3, :3] = rotation_vector_jacobian(tangent[:, :3])
-        return derivative
+        by_tangent = rotation_vector_jacobian(tangent[:, :3])
+
+        def system_of(part: _Part) -> tuple[FloatArray, ...]:
+            return joint_kernels.joint_system(
+                part.offsets,
+                self.origin[part.lines],
+                v[part.lines],
+                m[part.lines],
+                jacobian[part.lines],
+                poses.rotation,
+                poses.translation,
+                by_tangent,
+                self.frame_of,
+                self.observation[part.rows],
+                self.forms,
+                weight[part.rows],
+            )
+
+        cost, by_line, by_lines, by_pose, by_poses, rows = zip(
+            *self._of_parts(system_of), strict=True
+        )
+        return (
+            np.concatenate(cost),
+            np.concatenate(by_line),
+            np.concatenate(by_lines),
+            np.sum(by_pose, axis=0),
+            np.sum(by_poses, axis=0),
+            np.concatenate(rows),
+        )
 
     def reduced(self, system: _System, damping: float) -> _Reduced:
         """The system of the control points alone."""
@@ -338,38 +403,43 @@ class _Problem:
             "li,ij->lij", damping * diagonal + RIDGE, np.eye(4)
         )
         inverse = np.linalg.inv(damped)
-        # (L, 4, 4) with factor^T factor = inverse: the product below stays symmetric.
-        factor = np.swapaxes(np.linalg.cholesky(inverse), -1, -2)
         hessian, gradient = system.control_hessian.copy(), system.control_gradient.copy()
-        for lines, blocks in self._blocks(system) if self.free_lines else ():
-            solved = (factor[lines] @ blocks).reshape(-1, hessian.shape[0])
-            hessian -= solved.T @ solved
-            weighted = np.einsum("lij,lj->li", inverse[lines], system.line_gradient[lines])
-            gradient -= np.einsum("lik,li->k", blocks, weighted)
+        if self.free_lines:
+            taken, pull = self._taken_by_lines(system, inverse)
+            hessian -= taken
+            gradient -= pull
         hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
         return _Reduced(hessian=hessian, gradient=gradient, line_inverse=inverse)
 
-    def _blocks(self, system: _System) -> Iterator[tuple[slice, FloatArray]]:
-        """Lines in turn with their (l, 4, 6 K) blocks by the control points."""
-        control_count = self.shares.shape[1]
-        step = max(1, BLOCK_SIZE // (4 * 6 * control_count))
-        line_count = len(self.offsets) - 1
-        for first in range(0, line_count, step):
-            last = min(first + step, line_count)
-            yield (
-                slice(first, last),
-                joint_kernels.by_control(
-                    self.offsets,
-                    self.frame_of,
-                    self.observation,
-                    system.rows,
-                    self.first_control,
-                    self.basis,
-                    control_count,
-                    first,
-                    last,
-                ),
+    def _taken_by_lines(
+        self, system: _System, inverse: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(6 K, 6 K) and (6 K,) what eliminating the lines takes from the control points' equations.
+
+        Args:
+            inverse: (L, 4, 4) of the lines' damped Hessians.
+        """
+        # (L, 4, 4) with factor^T factor = inverse: the product stays symmetric.
+        factor = np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(inverse), -1, -2))
+        frame = self.frame_of[self.observation]
+
+        def taken_by(part: _Part) -> tuple[FloatArray, FloatArray]:
+            return joint_kernels.eliminated(
+                part.offsets,
+                system.rows[part.rows],
+                factor[part.lines],
+                system.line_gradient[part.lines],
+                self.first_control[frame[part.rows]],
+                self.basis[frame[part.rows]],
+                self.shares.shape[1],
             )
+
+        taken, pull = (sum(of_parts) for of_parts in zip(*self._of_parts(taken_by), strict=True))
+        return np.asarray(np.triu(taken) + np.triu(taken, 1).T), np.asarray(pull)
+
+    def _of_parts(self, function: Callable[[_Part], Result]) -> list[Result]:
+        """What a function makes of each part of the lines; in threads, always the same parts."""
+        return list(in_order(function, self.parts, self.worker_count))
 
     def step(
         self, state: _State, system: _System, reduced: _Reduced, weight: FloatArray

@@ -23,7 +23,7 @@ from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.front_end import Detected, lines_of_all_frames
+from roel_service.mapping.front_end import Detected, lines_of_all_frames, worker_count
 from roel_service.mapping.joint import JointlyRefined, refine_jointly
 from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
@@ -354,7 +354,15 @@ def _with_own_lines(
         _check_count(refined)
         with run.stage("refine"):
             directions = direction_prior(refined, gated.refine)
-            joint = refine_jointly(refined, correction, drift, detected, gated.refine, directions)
+            joint = refine_jointly(
+                refined,
+                correction,
+                drift,
+                detected,
+                gated.refine,
+                directions,
+                worker_count=worker_count(config),
+            )
             correction, drift = joint.correction, joint.drift
             frames, evidence = _seen_with(detected, correction)
             refined = run.without_diverged(
@@ -391,7 +399,14 @@ def _in_map(
         _check_count(refined)
         with run.stage("refine"):
             joint = refine_jointly(
-                refined, correction, drift, detected, gated.refine, None, free_lines=False
+                refined,
+                correction,
+                drift,
+                detected,
+                gated.refine,
+                None,
+                free_lines=False,
+                worker_count=worker_count(config),
             )
             correction, drift = joint.correction, joint.drift
         found.append(joint)

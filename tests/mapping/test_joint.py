@@ -206,8 +206,9 @@ class TestGradient:
         for line in range(line_count):
             at = slice(4 * line, 4 * line + 4)
             whole[at, at] = system.line_hessian[line]
-        for lines, blocks in problem._blocks(system):
-            whole[4 * lines.start : 4 * lines.stop, 4 * line_count :] = blocks.reshape(-1, size)
+        shares = problem.shares.toarray()[problem.frame_of[problem.observation]]
+        for line, rows, share in zip(problem.line, system.rows, shares, strict=True):
+            whole[4 * line : 4 * line + 4, 4 * line_count :] += np.kron(share, rows)
         whole[4 * line_count :, : 4 * line_count] = whole[: 4 * line_count, 4 * line_count :].T
         whole[4 * line_count :, 4 * line_count :] = system.control_hessian
         gradient = np.concatenate([system.line_gradient.ravel(), system.control_gradient])
