@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.geometry.se3 import SE3
-from roel_service.geometry.vectors import dot, norm, unit
-from roel_service.pano_loc import refine_kernels
-from roel_service.pano_loc.arcs import PanoramaArcs
+from roel_service.geometry.vectors import norm, unit
+from roel_service.pano_loc import sight_kernels
+from roel_service.pano_loc.sight_kernels import LinePoints, Samples
 
 # Arcs must have a line's direction within the gate; the width is that of the kernel.
 GATE_RAD, WIDTH_RAD = np.deg2rad(6.0), np.deg2rad(0.7)
@@ -40,58 +38,34 @@ def two_way_score(explained_2d: float, explained_3d: float) -> float:
     return (explained_2d + COVERAGE_WEIGHT * explained_3d) / (1.0 + COVERAGE_WEIGHT)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LinePoints:
-    """Points of a map's lines, in the middles of equal parts.
-
-    Attributes:
-        points: (P, 3) m; those of line j are offsets[j]:offsets[j + 1].
-        offsets: (L + 1,).
-        length_m: (P,) that each stands for.
-        directions: (L, 3) unit.
-    """
-
-    points: FloatArray
-    offsets: IntArray
-    length_m: FloatArray
-    directions: FloatArray
-
-    @staticmethod
-    def of(segments: FloatArray, spacing_m: float) -> LinePoints:
-        """Of (L, 2, 3) m, at most so far apart; every line has one."""
-        span = segments[:, 1] - segments[:, 0]
-        length_m, directions = norm(span), unit(span)
-        counts = np.maximum(np.ceil(length_m / spacing_m), 1).astype(np.int64)
-        offsets = np.concatenate([[0], np.cumsum(counts)])
-        line = np.repeat(np.arange(len(counts)), counts)
-        along_m = (np.arange(len(line)) - offsets[line] + 0.5) * (length_m / counts)[line]
-        points = segments[line, 0] + along_m[:, None] * directions[line]
-        return LinePoints(
-            points=points,
-            offsets=offsets,
-            length_m=(length_m / counts)[line],
-            directions=directions,
-        )
-
-
-def covered(pose: SE3, arcs: PanoramaArcs, lines: LinePoints) -> float:
-    """Share of the map's lines, by the angle that they take up, on which arcs lie; 0 to 1."""
-    offset = (lines.points - pose.translation) @ pose.rotation
-    distance_m = np.maximum(norm(offset), refine_kernels.MIN_DISTANCE_M)
-    rays = offset / distance_m[:, None]
-    directions = lines.directions @ pose.rotation
-    off, crowd = refine_kernels.match_points(
-        rays,
-        lines.offsets,
-        directions,
-        arcs.normals,
-        np.cross(arcs.normals, arcs.starts),
-        np.cross(arcs.ends, arcs.normals),
-        GATE_RAD,
-        CROWD_REACH_RAD,
+def line_points(segments: FloatArray, spacing_m: float) -> LinePoints:
+    """Of (L, 2, 3) m, at most so far apart; every line has one."""
+    span = segments[:, 1] - segments[:, 0]
+    length_m, directions = norm(span), unit(span)
+    counts = np.maximum(np.ceil(length_m / spacing_m), 1).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    line = np.repeat(np.arange(len(counts)), counts)
+    along_m = (np.arange(len(line)) - offsets[line] + 0.5) * (length_m / counts)[line]
+    return LinePoints(
+        points=segments[line, 0] + along_m[:, None] * directions[line],
+        offsets=offsets,
+        length_m=(length_m / counts)[line],
+        directions=directions,
     )
-    along = dot(rays, np.repeat(directions, np.diff(lines.offsets), axis=0))
-    weight = lines.length_m * np.sqrt(np.maximum(0.0, 1.0 - along**2)) / distance_m
-    if len(arcs.sides):
-        weight *= (rays @ arcs.sides.T > 0.0).all(axis=1)
+
+
+def covered(pose: SE3, samples: Samples, sides: FloatArray, lines: LinePoints) -> float:
+    """Share of the map's lines, by the angle that they take up, on which arcs lie; 0 to 1.
+
+    Args:
+        pose: T_world_picture.
+        samples: of the arcs.
+        sides: (V, 3) of the picture, as `PanoramaArcs` has them.
+        lines: of the map.
+    """
+    rays, weight, off, crowd = sight_kernels.match_points(
+        lines, pose.rotation, pose.translation, samples, GATE_RAD, CROWD_REACH_RAD
+    )
+    if len(sides):
+        weight *= (rays @ sides.T > 0.0).all(axis=1)
     return float(weight @ credit(off, crowd) / max(weight.sum(), 1e-9))

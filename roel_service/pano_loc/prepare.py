@@ -7,15 +7,15 @@ map lies in the world.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.segments import sample_segments
-from roel_service.geometry.vectors import dot, norm, unit
+from roel_service.geometry.vectors import unit
 from roel_service.pano_loc.directions import class_of, principal_frame, shared_directions
 from roel_service.pano_loc.views import (
     ClassedLines,
@@ -50,8 +50,6 @@ class PreparedMap:
 
     Attributes:
         segments: (L, 2, 3) m, longest first.
-        directions: (L, 3) unit.
-        channel: (L,) which shared direction a line has; -1 for none.
         shared: (D, 3) unit directions that many lines share, strongest first.
         frame: (3, 3) rotation whose rows are axes along shared directions.
         places: (T, 3) m, places that are tried.
@@ -61,8 +59,6 @@ class PreparedMap:
     """
 
     segments: FloatArray
-    directions: FloatArray
-    channel: IntArray
     shared: FloatArray
     frame: FloatArray
     places: FloatArray
@@ -73,23 +69,6 @@ class PreparedMap:
 
     def __len__(self) -> int:
         return len(self.segments)
-
-    def widest(self, place: FloatArray, count: int) -> PreparedMap:
-        """The same with the lines alone that take up most of the view from a (3,) place, m."""
-        if count >= len(self):
-            return self
-        offset = self.segments.mean(axis=1) - place
-        away = offset - dot(offset, self.directions)[:, None] * self.directions
-        size = (
-            norm(self.segments[:, 1] - self.segments[:, 0]) * norm(away) / (offset**2).sum(axis=1)
-        )
-        chosen = np.argpartition(-size, count)[:count]
-        return replace(
-            self,
-            segments=self.segments[chosen],
-            directions=self.directions[chosen],
-            channel=self.channel[chosen],
-        )
 
     @property
     def size_bytes(self) -> int:
@@ -135,8 +114,6 @@ def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:
     places, step_m = free_places(segments, frame, config.grid_step_m)
     return PreparedMap(
         segments=segments,
-        directions=directions,
-        channel=channel,
         shared=shared,
         frame=frame,
         places=places,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 
-from roel_service.arrays import BoolArray, FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import refine_kernels
@@ -15,24 +14,19 @@ from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
 from roel_service.pano_loc.coverage import (
     CROWD_REACH_RAD,
     GATE_RAD,
-    LinePoints,
     covered,
     credit,
+    line_points,
     two_way_score,
 )
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.search import Candidates
+from roel_service.pano_loc.sight_kernels import Samples
 
-# A step goes no farther; beyond it the residuals are not linear.
-MAX_SHIFT_M = 0.3
-MAX_TURN_RAD = np.deg2rad(8.0)
-DAMPING = 1e-3
 # Least squares: distance of samples, gate between arc and line, kernel width of each iteration.
 FINAL_STEP_RAD = np.deg2rad(3.0)
 FINAL_GATE_RAD = np.deg2rad(5.0)
 FINAL_WIDTHS_RAD = np.deg2rad([0.7] + [0.5] * 7)
-# Steps smaller than this, rad and m, are the last one.
-CONVERGED = 1e-4
 # The same for more of the modes, on fewer arcs.
 MODE_COUNT, MODE_WIDTHS_RAD = 24, np.deg2rad([3.0, 2.0, 1.5, 1.0, 0.7])
 MODE_ARC_COUNT, MODE_LINE_COUNT, MODE_STEP_RAD = 200, 600, np.deg2rad(6.0)
@@ -48,45 +42,26 @@ SAME_POSE_M, SAME_POSE_RAD = 0.25, np.deg2rad(8.0)
 UNREFINED_SHARE = 0.5
 
 
-# Offsets (A + 1,) and indices of the lines near each arc.
-Nearby = tuple[IntArray, IntArray]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Samples:
-    """Rays along the arcs, at about equal angles.
-
-    Attributes:
-        rays: (S, 3) unit, panorama frame; those of arc a are offsets[a]:offsets[a + 1].
-        offsets: (A + 1,).
-        weight: (S,) angle that each stands for, rad.
-        normals, middles: (A, 3) unit, of the arcs.
-        reach_rad: (A,) half their lengths.
-    """
-
-    rays: FloatArray
-    offsets: IntArray
-    weight: FloatArray
-    normals: FloatArray
-    middles: FloatArray
-    reach_rad: FloatArray
-
-
 def sample_arcs(arcs: PanoramaArcs, step_rad: float) -> Samples:
     """At least two rays an arc, in the middles of equal parts."""
     counts = np.maximum(np.ceil(arcs.length_rad / step_rad), 2).astype(np.int64)
     arc = np.repeat(np.arange(len(arcs)), counts)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     share = (np.arange(len(arc)) - offsets[arc] + 0.5) / counts[arc]
-    turn_rad = (share * arcs.length_rad[arc])[:, None]
-    aside = np.cross(arcs.normals, arcs.starts)
+    from_middle_rad = (share - 0.5) * arcs.length_rad[arc]
+    middles, reach_rad = unit(arcs.starts + arcs.ends), arcs.length_rad / 2
     return Samples(
-        rays=np.cos(turn_rad) * arcs.starts[arc] + np.sin(turn_rad) * aside[arc],
+        normals=arcs.normals.copy(),
+        middles=middles,
+        asides=np.cross(arcs.normals, middles),
+        columns=np.stack(
+            [*arcs.normals.T, *middles.T, np.cos(reach_rad), np.sin(reach_rad)], dtype=np.float32
+        ),
+        reach_rad=reach_rad,
         offsets=offsets,
+        cosine=np.cos(from_middle_rad),
+        sine=np.sin(from_middle_rad),
         weight=arcs.length_rad[arc] / counts[arc],
-        normals=arcs.normals,
-        middles=unit(arcs.starts + arcs.ends),
-        reach_rad=arcs.length_rad / 2,
     )
 
 
@@ -102,6 +77,7 @@ def refine_poses(
     if has_prior:
         mode_count, finalist_count = PRIOR_MODE_COUNT, PRIOR_FINALIST_COUNT
     few = sample_arcs(arcs.take(np.arange(min(len(arcs), MODE_ARC_COUNT))), MODE_STEP_RAD)
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
     modes = _refined(
         distinct(candidates, mode_count, UNREFINED_SHARE),
         few,
@@ -111,20 +87,21 @@ def refine_poses(
         MODE_LINE_COUNT,
     )
     if len(modes) > finalist_count:
-        modes = _weighed(modes, arcs, prepared)
+        modes = _weighed(modes, samples, arcs.sides, prepared)
     best = distinct(modes, finalist_count)
-    samples = sample_arcs(arcs, FINAL_STEP_RAD)
     refined = _refined(best, samples, prepared, FINAL_WIDTHS_RAD, FINAL_SLACK_RAD, len(prepared))
     return distinct(refined, finalist_count)
 
 
-def _weighed(modes: Candidates, arcs: PanoramaArcs, prepared: PreparedMap) -> Candidates:
+def _weighed(
+    modes: Candidates, samples: Samples, sides: FloatArray, prepared: PreparedMap
+) -> Candidates:
     """Modes scored in both directions: a map of many rooms explains much of any picture."""
     stride = -(-len(prepared) // WEIGHED_LINE_COUNT)
-    lines = LinePoints.of(prepared.segments[::stride], WEIGHED_SPACING_M)
+    lines = line_points(prepared.segments[::stride], WEIGHED_SPACING_M)
 
     def score(index: int) -> float:
-        shown = covered(modes.poses[index], arcs, lines)
+        shown = covered(modes.poses[index], samples, sides, lines)
         return two_way_score(float(modes.score[index]), shown)
 
     with ThreadPoolExecutor(THREAD_COUNT) as threads:
@@ -172,16 +149,19 @@ def _refined(
     """
 
     def refined(pose: SE3) -> tuple[SE3, float]:
-        lines = prepared.widest(pose.translation, line_count)
-        max_residual_rad = refine_kernels.CUTOFF_WIDTHS * widths_rad[0]
-        nearby = lines_nearby(pose, samples, lines, max_residual_rad, slack_rad)
-        for width_rad in widths_rad:
-            found = match(pose, samples, lines, nearby, FINAL_GATE_RAD)
-            step = _step(*equations(found, samples, lines, width_rad))
-            pose = pose.retract(step)
-            if width_rad == widths_rad[-1] and np.linalg.norm(step) < CONVERGED:
-                break
-        return pose, explained(pose, samples, lines, nearby)
+        lines = refine_kernels.widest(prepared.segments, pose.translation, line_count)
+        rotation, place, off, crowd = refine_kernels.refined(
+            lines,
+            pose.rotation,
+            pose.translation,
+            samples,
+            widths_rad,
+            FINAL_GATE_RAD,
+            slack_rad,
+            GATE_RAD,
+            CROWD_REACH_RAD,
+        )
+        return SE3(rotation=rotation, translation=place), explained(samples, off, crowd)
 
     with ThreadPoolExecutor(THREAD_COUNT) as threads:
         found = list(threads.map(refined, (candidates.poses[i] for i in range(len(candidates)))))
@@ -194,103 +174,12 @@ def _refined(
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Matches:
-    """Rays of a picture in the world's frame, and the lines that they lie on.
-
-    Attributes:
-        rays: (S, 3) unit.
-        seen: the lines from the pose's place.
-        line: (S,) index, -1 for none.
-        residual: (S,) sine of the angle between ray and line.
-    """
-
-    rays: FloatArray
-    seen: tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray]
-    line: IntArray
-    residual: FloatArray
-
-
-def lines_nearby(
-    pose: SE3,
-    samples: Samples,
-    prepared: PreparedMap,
-    max_residual_rad: float,
-    slack_rad: float = 0.0,
-) -> Nearby:
-    """Lines that rays of each arc may lie on at this pose, and at others that are close to it.
-
-    Args:
-        max_residual_rad: rays that are farther off a line do not count.
-        slack_rad: how much closer they may come at the other poses.
-    """
-    return refine_kernels.nearby_lines(
-        samples.middles @ pose.rotation.T,
-        samples.reach_rad,
-        samples.normals @ pose.rotation.T,
-        prepared.directions,
-        refine_kernels.viewed_lines(prepared.segments, pose.translation),
-        GATE_RAD,
-        max_residual_rad,
-        slack_rad,
-    )
-
-
-def match(
-    pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby, max_angle_rad: float
-) -> Matches:
-    """The nearest line of each ray, among those that the arc may be."""
-    rays, normals = samples.rays @ pose.rotation.T, samples.normals @ pose.rotation.T
-    seen = refine_kernels.viewed_lines(prepared.segments, pose.translation)
-    line, residual = refine_kernels.match_rays(
-        rays, samples.offsets, normals, prepared.directions, seen, nearby, max_angle_rad
-    )
-    return Matches(rays=rays, seen=seen, line=line, residual=residual)
-
-
-def equations(
-    found: Matches, samples: Samples, prepared: PreparedMap, width_rad: float
-) -> tuple[FloatArray, FloatArray]:
-    """(6, 6) of the Gauss-Newton step at a pose, and (L, 6) gradient by line; tangent (r, d)."""
-    H, g = refine_kernels.normal_equations(
-        found.rays,
-        samples.weight,
-        prepared.segments,
-        found.seen,
-        found.line,
-        found.residual,
-        width_rad,
-    )
-    return H, g
-
-
-def explained(pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby) -> float:
+def explained(samples: Samples, off: FloatArray, crowd: Array) -> float:
     """Share of the arcs' length that lines of the map explain, 0 to 1.
 
     Args:
-        nearby: lines that are closer than `CROWD_REACH_RAD`; of fewer, crowds look smaller.
+        samples: of the arcs.
+        off: (S,) sine of the angle from each ray to the nearest line, which may be infinite.
+        crowd: (S,) lines near it.
     """
-    off, crowd = refine_kernels.crowd_on_rays(
-        samples.rays @ pose.rotation.T,
-        samples.offsets,
-        samples.normals @ pose.rotation.T,
-        prepared.directions,
-        refine_kernels.viewed_lines(prepared.segments, pose.translation),
-        nearby,
-        GATE_RAD,
-        CROWD_REACH_RAD,
-    )
     return float(samples.weight @ credit(off, crowd) / max(samples.weight.sum(), 1e-9))
-
-
-def _step(H: FloatArray, gradients: FloatArray) -> FloatArray:
-    """(6,) damped step, shortened to what stays linear."""
-    g = gradients.sum(axis=0)
-    damping = DAMPING * np.diag(np.maximum(np.diag(H), 1e-9))
-    step = -np.linalg.solve(H + damping, g)
-    shrink = max(
-        1.0,
-        float(np.linalg.norm(step[:3])) / MAX_TURN_RAD,
-        float(np.linalg.norm(step[3:])) / MAX_SHIFT_M,
-    )
-    return np.asarray(step / shrink)

@@ -12,22 +12,24 @@ from roel_service.arrays import FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
-from roel_service.pano_loc.coverage import CROWD_REACH_RAD, LinePoints, covered, two_way_score
+from roel_service.pano_loc.coverage import (
+    CROWD_REACH_RAD,
+    GATE_RAD,
+    covered,
+    line_points,
+    two_way_score,
+)
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.refine import (
     FINAL_GATE_RAD,
     FINAL_STEP_RAD,
     FINAL_WIDTHS_RAD,
-    Nearby,
-    Samples,
-    equations,
     explained,
-    lines_nearby,
-    match,
     sample_arcs,
 )
-from roel_service.pano_loc.refine_kernels import CUTOFF_WIDTHS
+from roel_service.pano_loc.refine_kernels import CUTOFF_WIDTHS, normal_equations
 from roel_service.pano_loc.search import Candidates
+from roel_service.pano_loc.sight_kernels import Pairs, Samples, Sight, match_rays, near, see
 from roel_service.scene.results import (
     LocalizationStatus,
     NoPoseReason,
@@ -92,13 +94,21 @@ def hypotheses(
     candidates: Candidates, arcs: PanoramaArcs, prepared: PreparedMap, map_index: int
 ) -> tuple[PoseHypothesis, ...]:
     """The candidates, weighed in both directions."""
-    samples, lines = (
-        sample_arcs(arcs, FINAL_STEP_RAD),
-        LinePoints.of(prepared.segments, POINT_SPACING_M),
-    )
+    samples = sample_arcs(arcs, FINAL_STEP_RAD)
+    lines = line_points(prepared.segments, POINT_SPACING_M)
 
     def weighed(index: int) -> PoseHypothesis:
-        return _hypothesis(candidates.poses[index], arcs, samples, lines, prepared, map_index)
+        pose = candidates.poses[index]
+        explained_2d, covariance = _explained(pose, samples, prepared.segments)
+        explained_3d = covered(pose, samples, arcs.sides, lines)
+        return PoseHypothesis(
+            T_world_panorama=pose,
+            score=two_way_score(explained_2d, explained_3d),
+            covariance=covariance,
+            explained_2d=explained_2d,
+            explained_3d=explained_3d,
+            map_index=map_index,
+        )
 
     with ThreadPoolExecutor(THREAD_COUNT) as threads:
         return tuple(threads.map(weighed, range(len(candidates))))
@@ -171,43 +181,34 @@ def is_same_answer(a: PoseHypothesis, b: PoseHypothesis) -> bool:
     return bool(turn_rad <= SAME_ANSWER_RAD and shift_m <= SAME_ANSWER_M)
 
 
-def _hypothesis(
-    pose: SE3,
-    arcs: PanoramaArcs,
-    samples: Samples,
-    lines: LinePoints,
-    prepared: PreparedMap,
-    map_index: int,
-) -> PoseHypothesis:
-    nearby = lines_nearby(pose, samples, prepared, CROWD_REACH_RAD)
-    explained_2d = explained(pose, samples, prepared, nearby)
-    explained_3d = covered(pose, arcs, lines)
-    return PoseHypothesis(
-        T_world_panorama=pose,
-        score=two_way_score(explained_2d, explained_3d),
-        covariance=_covariance(pose, samples, prepared, nearby),
-        explained_2d=explained_2d,
-        explained_3d=explained_3d,
-        map_index=map_index,
-    )
+def _explained(pose: SE3, samples: Samples, segments: FloatArray) -> tuple[float, FloatArray]:
+    """Share of the picture that (L, 2, 3) segments explain, and the (6, 6) covariance."""
+    sight = see(segments, pose.rotation, pose.translation)
+    pairs = near(sight, samples, GATE_RAD, CROWD_REACH_RAD, 0.0)
+    line, residual, crowd = match_rays(sight, samples, pairs, GATE_RAD, CROWD_REACH_RAD)
+    off = np.where(line >= 0, np.abs(residual), np.inf)
+    inside = _covariance(sight, samples, pairs)
+    turn = np.kron(np.eye(2), pose.rotation)
+    return explained(samples, off, crowd), turn @ inside @ turn.T
 
 
-def _covariance(pose: SE3, samples: Samples, prepared: PreparedMap, nearby: Nearby) -> FloatArray:
-    """(6, 6) of (r, d): what the residuals of whole lines say about each other's pull.
+def _covariance(sight: Sight, samples: Samples, pairs: Pairs) -> FloatArray:
+    """(6, 6) of (r, d) in the picture's frame: what the residuals say about each other's pull.
 
     All samples of a line err together, and lines err independently. Where residuals are larger than
     those of the detector, the map is off, and that lines share: see `_inflation`.
     """
     width_rad = FINAL_WIDTHS_RAD[-1]
-    found = match(pose, samples, prepared, nearby, FINAL_GATE_RAD)
-    H, gradients = equations(found, samples, prepared, width_rad)
+    cutoff_rad = CUTOFF_WIDTHS * width_rad
+    line, residual, _ = match_rays(sight, samples, pairs, FINAL_GATE_RAD, cutoff_rad)
+    H, gradients = normal_equations(sight, samples, line, residual, width_rad)
     inverse = np.linalg.inv(H + WEAKEST * np.eye(6))
     pull = gradients.T @ gradients
     line_count = int(np.count_nonzero(gradients.any(axis=1)))
     few = line_count / max(line_count - 6, 1)
     floor = np.diag([FLOOR_RAD**2] * 3 + [FLOOR_M**2] * 3)
-    used = (found.line >= 0) & (np.abs(found.residual) < CUTOFF_WIDTHS * width_rad)
-    mean_square = samples.weight[used] @ found.residual[used] ** 2
+    used = line >= 0
+    mean_square = samples.weight[used] @ residual[used] ** 2
     mean_square /= max(samples.weight[used].sum(), 1e-9)
     sandwich = few * inverse @ pull @ inverse + floor
     covariance = _inflation(float(mean_square)) * sandwich + WEAKEST * inverse

@@ -2,23 +2,28 @@ import numpy as np
 import pytest
 
 from roel_service.geometry.segments import length
-from roel_service.pano_loc.coverage import LinePoints, covered, credit, two_way_score
+from roel_service.pano_loc.coverage import covered, credit, line_points, two_way_score
+from roel_service.pano_loc.refine import FINAL_STEP_RAD, sample_arcs
 from tests.pano_loc.rooms import pose, seen_from, segments_of
 
 TRUTH = pose(1.7, 1.6, 1.4, 0.1, 0.2, 0.8)
 
 
+def shown_of(T, arcs, lines):
+    return covered(T, sample_arcs(arcs, FINAL_STEP_RAD), arcs.sides, lines)
+
+
 def test_points_stand_for_the_whole_length_of_their_lines():
-    lines = LinePoints.of(segments_of(), 0.1)
+    lines = line_points(segments_of(), 0.1)
     assert lines.length_m.sum() == pytest.approx(length(segments_of()).sum())
     assert lines.length_m.max() <= 0.1 + 1e-9
     assert len(lines.offsets) == len(segments_of()) + 1
 
 
 def test_a_picture_shows_the_map_where_it_was_taken_and_little_of_it_elsewhere():
-    arcs, lines = seen_from(TRUTH, segments_of()), LinePoints.of(segments_of(), 0.1)
-    here = covered(TRUTH, arcs, lines)
-    there = covered(TRUTH.retract(np.array([0.2, 0.3, 0.1, 0.5, 0.4, 0.2])), arcs, lines)
+    arcs, lines = seen_from(TRUTH, segments_of()), line_points(segments_of(), 0.1)
+    here = shown_of(TRUTH, arcs, lines)
+    there = shown_of(TRUTH.retract(np.array([0.2, 0.3, 0.1, 0.5, 0.4, 0.2])), arcs, lines)
     assert here > 0.95
     assert there < 0.5 * here
 
@@ -26,7 +31,7 @@ def test_a_picture_shows_the_map_where_it_was_taken_and_little_of_it_elsewhere()
 def test_of_half_the_lines_about_half_is_shown():
     segments = segments_of()
     arcs = seen_from(TRUTH, segments[::2])
-    shown = covered(TRUTH, arcs, LinePoints.of(segments, 0.1))
+    shown = shown_of(TRUTH, arcs, line_points(segments, 0.1))
     assert 0.3 < shown < 0.8
 
 
