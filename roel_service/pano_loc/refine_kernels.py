@@ -38,7 +38,7 @@ def widest(segments: FloatArray, place: FloatArray, count: int) -> FloatArray:
         across_square = max(0.0, length_square * square - along * along)
         size[j] = np.sqrt(across_square) / max(square, 1e-12)
     least = np.partition(size, len(size) - count)[len(size) - count]
-    return segments[size >= least]
+    return np.asarray(segments[size >= least])
 
 
 @numba.njit(cache=True, nogil=True)
@@ -168,17 +168,14 @@ def _damped_step(H: FloatArray, g: FloatArray) -> FloatArray:
         damped[p, p] += DAMPING * max(H[p, p], 1e-9)
     step = -np.linalg.solve(damped, g)
     turn_rad, shift_m = np.sqrt((step[:3] ** 2).sum()), np.sqrt((step[3:] ** 2).sum())
-    return step / max(1.0, turn_rad / MAX_TURN_RAD, shift_m / MAX_SHIFT_M)
+    return np.asarray(step / max(1.0, turn_rad / MAX_TURN_RAD, shift_m / MAX_SHIFT_M))
 
 
 @numba.njit(cache=True, nogil=True)
 def _rotation(vector: FloatArray) -> FloatArray:
     """(3, 3) Exp of a (3,) vector, rad, by Rodrigues' formula."""
-    angle = np.sqrt((vector**2).sum())
-    x, y, z = vector
-    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    if angle < 1e-9:
-        return np.eye(3) + skew
-    return (
-        np.eye(3) + np.sin(angle) / angle * skew + (1.0 - np.cos(angle)) / angle**2 * (skew @ skew)
-    )
+    angle = max(np.sqrt((vector**2).sum()), 1e-12)
+    x, y, z = vector / angle
+    axis = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn = np.eye(3) + np.sin(angle) * axis + (1.0 - np.cos(angle)) * (axis @ axis)
+    return np.asarray(turn)
