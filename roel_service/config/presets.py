@@ -48,6 +48,8 @@ PAPER = Config(
         corner_sigma_m=0.0,
         max_residual_px=20.0,
         min_inlier_count=10,
+        pose_method="batch",
+        pose_iteration_count=60,
     ),
     # What triangulation takes from here; the rest of its cost is its own.
     refine_rounds=RefineRoundsConfig(loss_scale_px=0.7, max_residual_px=20.0, min_inlier_count=10),

@@ -19,6 +19,7 @@ MATCH_GLOBAL_METHODS = ("reassociate", "sampled", "none")
 MATCHERS = ("geometric", "xfeat", "aliked", "disk", "loftr")
 TRIANGULATE_GATES = ("pixel", "grassmann")
 REFINE_RESIDUALS = ("pixel", "grassmann", "reprojection")
+POSE_METHODS = ("smooth", "batch")
 REFINE_LOSSES = ("cauchy", "squared", "quartic")
 TRIM_METHODS = ("coverage", "cluster")
 CURVE_METHODS = ("none", "polyline", "bezier")
@@ -367,6 +368,9 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         corner_depth_m: lines known better than this end at corners; lines known worse are held to
             corners that agree about their depth within this.
         free_poses: refine the poses together with the lines, then map with the refined ones.
+        pose_method: `smooth` (a smooth correction of the given poses, in rounds with matching) or
+            `batch` (as published: one free pose a frame, with lines triangulated once; the residual
+            is `grassmann` or `reprojection`).
         pose_gates_px: with free poses, distance within which lines take up observations, one value
             a round of matching and refinement.
         pose_turn_deg: how far the given poses may be turned against one another; the first gates are
@@ -387,6 +391,7 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
     corner_distance_px: float = parameter(5.0, POSITIVE)
     corner_depth_m: float = parameter(0.03, POSITIVE)
     free_poses: bool = False
+    pose_method: str = parameter("smooth", one_of(POSE_METHODS))
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.0, 1.3), SOME_POSITIVE)
     pose_turn_deg: float = parameter(0.78, POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)

@@ -48,6 +48,14 @@ def align_points(source: FloatArray, target: FloatArray, *, with_scale: bool) ->
     return Similarity(scale=scale, T_target_source=SE3(rotation=rotation, translation=translation))
 
 
+def as_large_as(source: SE3, target: SE3) -> SE3:
+    """The (N) poses of `source` on a path as large as that of `target`, about its own middle."""
+    scale = align_points(source.translation, target.translation, with_scale=True).scale
+    middle = source.translation.mean(axis=0)
+    translation = middle + scale * (source.translation - middle)
+    return SE3(rotation=source.rotation, translation=translation)
+
+
 def align_poses(source: SE3, target: SE3, *, lever_m: float = 0.0) -> SE3:
     """T_target_source that brings corresponding poses together, by least squares.
 

@@ -1,5 +1,7 @@
 """The published batch: all lines and one free pose a frame at once, the first pose held.
 
+Held too are frames that see too few lines for a pose.
+
 Paper: "Multi-view Line Optimization" with free poses, and "Pose Refinement". The line term is the
 plane-to-line residual or, to compare with, LIMAP's reprojection; the event term is the angle
 between the events' rays and the plane that the frame's camera spans with the line. Of a world that
@@ -32,8 +34,12 @@ from roel_service.mapping.refine import (
 from roel_service.mapping.views import Views, cuts_m, views_of
 from roel_service.scene.lines import InfiniteLines
 
+# Line terms that it has.
+RESIDUALS = ("grassmann", "reprojection")
 # Unknowns that are solved for at once: their normal equations take 512 MiB.
 MAX_UNKNOWN_COUNT = 8192
+# A frame that sees fewer lines keeps its pose: three would do if they were exact.
+MIN_ROW_COUNT = 6
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 8
 # A step that lowers the cost by less than this share ends the iteration.
@@ -52,10 +58,13 @@ class BatchRefined:
         T_world_camera: (N) poses of the frames.
         costs: before the first step and after every one.
         converged: the last step changed next to nothing.
+        covariance: (N, 6, 6) of the poses, order (r, d), world; zero for those that were held. The
+            noise is what the residuals show.
     """
 
     lines: InfiniteLines
     T_world_camera: SE3
+    covariance: FloatArray
     costs: list[float]
     converged: bool
 
@@ -94,7 +103,7 @@ class _Term:
 
 
 def refine_batch(refined: Refined, detected: Detected, config: RefineConfig) -> BatchRefined:
-    """Refine all lines and the poses of all frames but the first.
+    """Refine all lines and the poses of all frames but the first, and those that see hardly any.
 
     Args:
         refined: L first estimates with their tracks.
@@ -140,6 +149,7 @@ def refine_batch(refined: Refined, detected: Detected, config: RefineConfig) -> 
     return BatchRefined(
         lines=problem.world_lines(state),
         T_world_camera=state.poses,
+        covariance=problem.covariance(state),
         costs=costs,
         converged=converged,
     )
@@ -157,6 +167,8 @@ class _Problem:
         self.line = tracks.track_of_row
         self.frame = detected.observations.frame[tracks.observation].astype(np.int64)
         self.line_count = len(refined)
+        self.is_held = np.bincount(self.frame, minlength=len(self.frames)) < MIN_ROW_COUNT
+        self.is_held[0] = True
         self.origin = refined.origin
         self.length_px = evidence.views.length_px[tracks.observation]
         events = np.minimum(evidence.event_counts, config.event_count_per_line or np.inf)
@@ -272,8 +284,7 @@ class _Problem:
         line_columns = 4 * self.line[:, None, None] + np.arange(4)
         first_pose = 4 * self.line_count - 6
         pose_columns = first_pose + 6 * self.frame[:, None, None] + np.arange(6)
-        # The first pose is held.
-        by_pose = np.where(self.frame[:, None, None] > 0, term.by_pose, 0.0)
+        by_pose = np.where(self.is_held[self.frame][:, None, None], 0.0, term.by_pose)
         pose_columns = np.maximum(pose_columns, 0)
         shape = (row_count * size, 4 * self.line_count + 6 * (len(self.frames) - 1))
         lines = _sparse(rows, line_columns, term.by_line, shape)
@@ -283,11 +294,7 @@ class _Problem:
         self, state: _State, gradient: FloatArray, hessian: FloatArray, damping: float
     ) -> _State:
         """One damped step of everything."""
-        # In units in which every diagonal element is one: radians and metres do not compare.
-        size = np.sqrt(np.diagonal(hessian))
-        size[size == 0.0] = 1.0
-        damped = hessian / np.outer(size, size)
-        damped[np.diag_indices_from(damped)] += damping
+        damped, size = _damped(hessian, damping)
         grows, left_m2 = self._growth(state)
         sides = np.stack([-gradient, grows], axis=-1) / size[:, None]
         free, held = linalg.solve(damped, sides, assume_a="pos").T / size
@@ -300,13 +307,45 @@ class _Problem:
         poses = state.poses.retract(np.concatenate([np.zeros((1, 6)), by_pose]))
         return _State(lines=OrthonormalLines(U=U, phi=phi), poses=poses)
 
+    def covariance(self, state: _State) -> FloatArray:
+        """(N, 6, 6) of the poses, with the scale held."""
+        terms = self.terms(state)
+        _, hessian = self.normal_equations(terms)
+        damped, size = _damped(hessian, LEAST_DAMPING)
+        inverse = linalg.inv(damped) / np.outer(size, size)
+        grows, _ = self._growth(state)
+        along = inverse @ grows
+        room = float(grows @ along)
+        if room > 0.0:
+            inverse -= np.outer(along, along) / room
+        row_count = sum(term.residual.size for term in terms)
+        variance = _cost(terms) / max(1, row_count - len(hessian))
+        covariance = np.zeros((len(self.frames), 6, 6))
+        for pose in np.flatnonzero(~self.is_held):
+            first = 4 * self.line_count + 6 * (pose - 1)
+            covariance[pose] = variance * inverse[first : first + 6, first : first + 6]
+        return covariance
+
     def _growth(self, state: _State) -> tuple[FloatArray, float]:
         """(U,) how the path's extent grows with the unknowns, and what it lacks of the given one."""
         grows = np.zeros(4 * self.line_count + 6 * (len(self.frames) - 1))
         position = state.poses.translation
         by_pose = grows[4 * self.line_count :].reshape(-1, 6)
         by_pose[:, 3:] = 2.0 * (position[1:] - position[0]) / len(position)
+        by_pose[self.is_held[1:]] = 0.0
         return grows, self.extent_m2 - _extent_m2(state.poses)
+
+
+def _damped(hessian: FloatArray, damping: float) -> tuple[FloatArray, FloatArray]:
+    """A damped Hessian in units in which its diagonal is one, and the (U,) units.
+
+    Radians and metres do not compare.
+    """
+    size = np.sqrt(np.diagonal(hessian))
+    size[size == 0.0] = 1.0
+    damped = hessian / np.outer(size, size)
+    damped[np.diag_indices_from(damped)] += damping
+    return damped, size
 
 
 def _extent_m2(poses: SE3) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roel_service.config.stages import Config
+from roel_service.errors import NoAnswerError
 from roel_service.mapping.cached_stages import triangulation_cost
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
@@ -22,6 +23,16 @@ from roel_service.mapping.run import MappingRun
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.scene.lines import LineTracks
 from roel_service.scene.results import TrackStatus
+
+# Fewer lines than this do not hold six unknowns.
+MIN_LINE_COUNT = 6
+
+
+def check_line_count(refined: Refined) -> None:
+    """Raise `NoAnswerError` if the lines do not hold the six unknowns of a pose."""
+    if len(refined) < MIN_LINE_COUNT:
+        expected = f"at least {MIN_LINE_COUNT} lines in view"
+        raise NoAnswerError("poses", expected, f"{len(refined)}", reason="TOO_FEW_LINES")
 
 
 def matched_tracks(

@@ -1,8 +1,8 @@
 """Noisy poses made good by the lines that they see.
 
 Paper: "Pose Refinement". The published batch optimisation moves the poses of triangulated lines
-once; here matching and joint refinement take turns while the gates close, so that poses that are
-too poor for the right matches get better ones.
+once (`batch_poses`); here matching and joint refinement take turns while the gates close, so that
+poses that are too poor for the right matches get better ones.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import Config, RefineConfig, RefineRoundsConfig
-from roel_service.errors import NoAnswerError
 from roel_service.geometry import plucker
-from roel_service.geometry.alignment import align_points, align_poses
+from roel_service.geometry.alignment import align_poses, as_large_as
 from roel_service.geometry.se3 import SE3
+from roel_service.mapping.batch_poses import refine_poses_at_once
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
+from roel_service.mapping.first_lines import check_line_count
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected, lines_of_all_frames, worker_count
 from roel_service.mapping.joint import JointlyRefined, refine_jointly
@@ -47,8 +48,6 @@ logger = logging.getLogger(__name__)
 
 Costs = TypeVar("Costs", bound=RefineRoundsConfig)
 
-# Fewer lines than this do not hold six unknowns.
-MIN_LINE_COUNT = 6
 # The first gates in a given map are so much wider than those of a recording's own lines: its world
 # and that of the poses need not be quite the same.
 MAP_GATES = (4.0, 2.0)
@@ -117,9 +116,11 @@ def refine_poses(
         trajectory: poses on the clock of the events.
         camera: calibration of the sensor.
         config: parameters of every stage; those of the poses are in `refine`.
-        line_map: lines that stay as they are; the given poses are roughly those in its world.
+        line_map: lines that stay as they are; the given poses are roughly those in its world. What
+            finds poses there is the smooth correction, whichever method is configured.
         estimate_time_offset: whether the clock of the poses may run beside that of the events; the
-            result is on the latter, at the times that were given.
+            result is on the latter, at the times that were given. The published batch
+            (`refine.pose_method`) does not tell.
         progress: called often; may raise `Cancelled`.
 
     Raises:
@@ -129,6 +130,8 @@ def refine_poses(
         NoAnswerError: too few lines.
         Cancelled: as raised by `progress`.
     """
+    if config.refine.pose_method == "batch" and line_map is None:
+        return refine_poses_at_once(events, trajectory, camera, config, progress)
     seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
     applied_us = 0
     count = MAX_OFFSET_COUNT if estimate_time_offset else 1
@@ -219,7 +222,8 @@ def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) 
     asked = _of_window(trajectory, found.window)
     poses = found.last.correction.trajectory(found.smooth).T_world_camera
     if is_aligned:
-        poses = _as_large_as(poses, asked.T_world_camera)
+        # Steps of the solver drift along the scale, by more than the given poses are off.
+        poses = as_large_as(poses, asked.T_world_camera)
         poses = align_poses(poses, asked.T_world_camera) @ poses
     if found.given.t_us[0] == asked.t_us[0]:
         return poses
@@ -227,17 +231,6 @@ def _at_given_times(found: _Found, trajectory: Trajectory, *, is_aligned: bool) 
     # Poses that the other clock leaves without a time of their own stay at the ends.
     times_us = np.clip(asked.t_us, refined.t_us[0], refined.t_us[-1])
     return refined.interpolate(times_us)
-
-
-def _as_large_as(poses: SE3, given: SE3) -> SE3:
-    """Poses whose path is as large as that of the given ones: lines do not tell the scale.
-
-    Steps of the solver drift along it, by more than the given poses are off.
-    """
-    scale = align_points(poses.translation, given.translation, with_scale=True).scale
-    middle = poses.translation.mean(axis=0)
-    translation = middle + scale * (poses.translation - middle)
-    return SE3(rotation=poses.rotation, translation=translation)
 
 
 def _report(
@@ -351,7 +344,7 @@ def _with_own_lines(
                 gated,
                 run.step,
             )
-        _check_count(refined)
+        check_line_count(refined)
         with run.stage("refine"):
             directions = direction_prior(refined, gated.refine)
             joint = refine_jointly(
@@ -396,7 +389,7 @@ def _in_map(
             refined = match_fixed_lines(
                 lines, line_map.segments, evidence, detected.observations, frames, poses, gated
             )
-        _check_count(refined)
+        check_line_count(refined)
         with run.stage("refine"):
             joint = refine_jointly(
                 refined,
@@ -411,12 +404,6 @@ def _in_map(
             correction, drift = joint.correction, joint.drift
         found.append(joint)
     return refined, found
-
-
-def _check_count(refined: Refined) -> None:
-    if len(refined) < MIN_LINE_COUNT:
-        expected = f"at least {MIN_LINE_COUNT} lines in view"
-        raise NoAnswerError("poses", expected, f"{len(refined)}", reason="TOO_FEW_LINES")
 
 
 def _with_gate(config: Config, gate_px: float) -> Config:

@@ -13,6 +13,7 @@ from roel_service.config.stages import (
     MATCH_GLOBAL_METHODS,
     MATCHERS,
     PLANE_FIT_METHODS,
+    POSE_METHODS,
     REFINE_LOSSES,
     REFINE_RESIDUALS,
     REPRESENTATIONS,
@@ -32,6 +33,7 @@ CHOICES = {
     "refine_rounds.loss": REFINE_LOSSES,
     "refine.residual": REFINE_RESIDUALS,
     "refine.loss": REFINE_LOSSES,
+    "refine.pose_method": POSE_METHODS,
     "trim.method": TRIM_METHODS,
     "curves.method": CURVE_METHODS,
 }

@@ -10,6 +10,7 @@ from roel_service.mapping import batch
 from roel_service.mapping.batch import _Problem, _State, refine_batch
 from roel_service.mapping.front_end import Detected
 from roel_service.mapping.refine import OrthonormalLines, refine_lines
+from roel_service.scene.lines import LineTracks
 
 from .synthetic import observed, world
 
@@ -81,6 +82,24 @@ def test_the_first_pose_is_held():
     np.testing.assert_allclose(found.T_world_camera[0].matrix(), first.matrix(), atol=1e-12)
 
 
+def test_a_frame_that_sees_hardly_any_line_keeps_its_pose():
+    exact = world()
+    detected = seen(exact, PAPER, wrong_poses(exact))
+    lines = lines_of(exact, PAPER)
+    tracks, poor = lines.tracks, 5
+    is_seen = detected.observations.frame[tracks.observation] != poor
+    is_seen[np.flatnonzero(~is_seen)[: batch.MIN_ROW_COUNT - 1]] = True
+    tracks = LineTracks.from_rows(
+        tracks.track_of_row[is_seen], tracks.observation[is_seen], len(tracks)
+    )
+    found = refine_batch(dataclasses.replace(lines, tracks=tracks), detected, PAPER)
+    before, after = detected.frames.T_world_camera, found.T_world_camera
+    step_m = np.linalg.norm(after.translation - before.translation, axis=1)
+    assert step_m[poor] < 1e-12 < step_m[poor + 1]
+    assert not found.covariance[poor].any()
+    assert found.covariance[poor + 1].any()
+
+
 @pytest.mark.parametrize("name", CONFIGS)
 def test_the_path_stays_as_large_as_it_is_given(name):
     exact, config = world(), CONFIGS[name]
@@ -119,6 +138,16 @@ def test_gradients_agree_with_central_differences(name):
         slope = (cost(unknown, 1e-6) - cost(unknown, -1e-6)) / 2e-6
         # The middles of the observed intervals move too, which the derivative leaves out.
         assert slope == pytest.approx(2.0 * gradient[unknown], abs=0.02 * largest)
+
+
+def test_the_covariance_is_as_large_as_the_errors_that_noise_makes():
+    noisy, config = world(noise_px=0.3), CONFIGS["lines alone"]
+    found = refine_batch(lines_of(noisy, config), seen(noisy, config), config)
+    assert not found.covariance[0].any()
+    assert np.linalg.eigvalsh(found.covariance[1:]).min() > 0.0
+    off = found.T_world_camera.translation - noisy.frames.T_world_camera.translation
+    told_m = np.sqrt(np.trace(found.covariance[:, 3:, 3:], axis1=1, axis2=2).mean())
+    assert 0.3 < np.sqrt(np.mean(np.sum(off**2, axis=-1))) / told_m < 3.0
 
 
 def test_too_many_unknowns_are_refused(monkeypatch):
