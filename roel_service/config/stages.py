@@ -546,8 +546,8 @@ class TrackConfig(Stage, table="track"):
     line_noise_m: float = parameter(0.002, POSITIVE)
     min_seen_share: float = parameter(0.6, SHARE)
     min_sharpness: float = parameter(20.0, POSITIVE)
-    max_sigma_m: float = parameter(0.03, POSITIVE)
-    max_sigma_deg: float = parameter(1.0, POSITIVE)
+    max_sigma_m: float = parameter(0.012, POSITIVE)
+    max_sigma_deg: float = parameter(0.5, POSITIVE)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ pose of its own time; the motion model's forecast is their prior.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,11 @@ class Window:
     span_s: float
     is_quiet: bool
     event_count: int
+
+    def thinned(self, most: int) -> Window:
+        """The window with `most` of its events, or a few more."""
+        chosen = slice(0, None, max(1, len(self.slot) // most))
+        return replace(self, xy_px=self.xy_px[chosen], slot=self.slot[chosen])
 
 
 @dataclass(frozen=True, kw_only=True)

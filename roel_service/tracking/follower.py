@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from roel_service.tracking.verdict import Verdict, convinces
 # A line that was seen so long ago is known to be in sight: it is not hidden, if it has no events.
 MEMORY_US = 300_000
 LONG_AGO_US = -(1 << 60)
+# A right state is some such deviations from the forecast. One that is farther away is off by as much
+# more than its covariance says: the motion was not what it was taken for, or the lines were not.
+EXPECTED_SURPRISE = 1.5
 # What a window explained counts less in every later one.
 FADE = 0.8
 # Another answer that explains this share of what the best one does is a rival.
@@ -50,6 +54,11 @@ class Follower:
     def state(self) -> MotionState:
         return self.fit.state
 
+    def instead(self, fit: WindowFit) -> Follower:
+        """Another answer for the last window, as if it had been followed so far."""
+        explained_count = self.fit.evidence.explained_count
+        return Follower(fit, self.explained_count / explained_count if explained_count else 1.0)
+
     def follow(self, window: Window, eyes: Eyes, config: TrackConfig) -> None:
         """Go on to the next window."""
         after_s = (window.t_us - self.state.t_us) * 1e-6
@@ -57,9 +66,12 @@ class Follower:
         forecast = self.state.foretold(window.t_us, config)
         scales_px = UNSURE_SCALES_PX if is_unsure else EVENT_SCALES_PX
         known = window.t_us - self._seen_us <= MEMORY_US
-        self.fit = fit_window(forecast, window, eyes.pieces, eyes.view, config, scales_px, known)
+        fit = fit_window(forecast, window, eyes.pieces, eyes.view, config, scales_px, known)
+        doubt = max(1.0, fit.surprise / EXPECTED_SURPRISE) ** 2
+        self.fit = replace(fit, state=fit.state.stepped(np.zeros(12), doubt * fit.state.covariance))
         self._seen_us[self.fit.seen] = window.t_us
-        self._cautious = cautious_covariance(faded(self._cautious, after_s, config), self.fit)
+        cautious = cautious_covariance(faded(self._cautious, after_s, config), self.fit)
+        self._cautious = doubt * cautious
         self.status = self._verdict.of(self.fit, self._cautious, config)
         self.explained_count *= FADE
         self.explained_count += self.fit.evidence.explained_count

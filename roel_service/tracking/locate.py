@@ -76,7 +76,9 @@ def locate(
     sampled = _sampled(lines, window.t_us)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
-        for state in (_turning(pose, sight.turn_rate, window.t_us, config) for pose in poses)
+        for state in (
+            roughly_at(pose, _turning(pose, sight.turn_rate), window.t_us, config) for pose in poses
+        )
     ]
     best = distinct(sorted(fits, key=explained_count, reverse=True))
     on_events = [
@@ -107,8 +109,8 @@ def is_same_pose(one: MotionState, other: MotionState) -> bool:
     return bool(turn_rad < np.deg2rad(SAME_DEG) and shift_m < SAME_M)
 
 
-def _turning(pose: SE3, turn_rate: FloatArray, t_us: int, config: TrackConfig) -> MotionState:
-    """A pose of which little is known, and of its motion what moves the picture as it does."""
+def roughly_at(pose: SE3, velocity: FloatArray, t_us: int, config: TrackConfig) -> MotionState:
+    """A pose and a (6,) velocity of which little is known."""
     deviation = [
         *[POSE_SIGMA_SHARE * np.deg2rad(config.reach_deg)] * 3,
         *[POSE_SIGMA_SHARE * config.reach_m] * 3,
@@ -118,9 +120,14 @@ def _turning(pose: SE3, turn_rate: FloatArray, t_us: int, config: TrackConfig) -
     return MotionState(
         t_us=t_us,
         T_world_camera=pose,
-        velocity=np.concatenate([pose.rotation @ turn_rate, np.zeros(3)]),
+        velocity=velocity,
         covariance=np.diag(np.square(deviation)),
     )
+
+
+def _turning(pose: SE3, turn_rate: FloatArray) -> FloatArray:
+    """(6,) velocity that moves the picture as a turn about (3,) camera axes does."""
+    return np.concatenate([pose.rotation @ turn_rate, np.zeros(3)])
 
 
 def _sampled(lines: FittedLines, t_us: int) -> Window:

@@ -15,6 +15,7 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream, time_not_monotone
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
+from roel_service.tracking.challenge import challengers
 from roel_service.tracking.fit import View, Window, WindowFit, window_of
 from roel_service.tracking.follower import Follower, rivals
 from roel_service.tracking.locate import locate
@@ -140,8 +141,8 @@ class PoseTracker:
         if not alive:
             self._lose()
             return _lost(window, best.fit)
-        if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1:
-            alive += self._second_opinions(window, around, best)
+        if not best.fit.evidence.is_still:
+            alive += self._others(window, around, best, is_alone=len(alive) == 1)
         best, *others = self._followers = rivals(alive)
         status = PoseStatus.UNCERTAIN if others else best.status
         if status is PoseStatus.TRACKING:
@@ -151,19 +152,19 @@ class PoseTracker:
         self._whereabouts.turned(turn_rate, window.span_s)
         return _told(window, status, best.fit)
 
-    def _second_opinions(
-        self, window: Window, around: EventStream, best: Follower
+    def _others(
+        self, window: Window, around: EventStream, best: Follower, *, is_alone: bool
     ) -> list[Follower]:
-        """Other answers near one that does not convince, as if they had been followed so far."""
-        evidence, place = best.fit.evidence, best.state.T_world_camera
-        if evidence.is_still or evidence.explained_count == 0.0:
-            # There is nothing to be explained.
-            return []
-        before = best.explained_count / evidence.explained_count
-        turn_rate = place.rotation.T @ best.state.velocity[:3]
-        sight = look(around, window.t_us, self._eyes, turn_rate)
-        fits = locate(place, sight, window, self._eyes, self._config, self._rng)
-        return [Follower(fit, before) for fit in fits if is_possible(fit, self._config)]
+        """Other answers in place of the best one, as if they had been followed so far."""
+        fits: list[WindowFit] = []
+        if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1:
+            place = best.state.T_world_camera
+            turn_rate = place.rotation.T @ best.state.velocity[:3]
+            sight = look(around, window.t_us, self._eyes, turn_rate)
+            fits = locate(place, sight, window, self._eyes, self._config, self._rng)
+        elif is_alone:
+            fits = challengers(best.state, window, self._eyes, self._config, self._rng)
+        return [best.instead(fit) for fit in fits if is_possible(fit, self._config)]
 
     def _found(self, window: Window, around: EventStream) -> TrackedPose:
         """Look for the camera, now and then; see how it turns, all the time."""

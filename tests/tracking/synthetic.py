@@ -11,9 +11,13 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
+from roel_service.tracking.fit import View, window_of
+from roel_service.tracking.pieces import pieces_of
+from roel_service.tracking.sight import Eyes
 
 CAMERA = Camera(width=240, height=180, fx_px=170.0, fy_px=170.0, cx_px=119.5, cy_px=89.5)
 STEP_US = 1_000
+WINDOW_US = 25_000
 NOISE_HZ = 0.5
 
 
@@ -104,3 +108,20 @@ def crossed(before, after):
         pixel[:, axis] = np.maximum(first, last)
         inside = (pixel >= 0).all(axis=1) & (pixel < [CAMERA.width, CAMERA.height]).all(axis=1)
         yield np.unique(pixel[inside & (first != last)].astype(np.int64), axis=0)
+
+
+def eyes_on(line_map):
+    return Eyes(
+        camera=CAMERA,
+        ideal_px=projection.undistortion_table(CAMERA),
+        view=View(K=CAMERA.matrix, width=CAMERA.width, height=CAMERA.height),
+        pieces=pieces_of(line_map),
+    )
+
+
+def window_at(t_us, events, most=8_000):
+    """The events of one interval around a time."""
+    span_us = (t_us - WINDOW_US // 2, t_us + WINDOW_US // 2)
+    start, stop = np.searchsorted(events.t_us, span_us)
+    ideal_px = projection.undistortion_table(CAMERA)
+    return window_of(events.slice(int(start), int(stop), t_us), ideal_px, span_us, most)

@@ -4,9 +4,18 @@ import numpy as np
 
 from roel_service.config.stages import TrackConfig
 from roel_service.geometry.se3 import SE3
-from roel_service.tracking.fit import Evidence, WindowFit
-from roel_service.tracking.follower import MAX_FOLLOWER_COUNT, Follower, cautious_covariance, rivals
+from roel_service.tracking.fit import Evidence, WindowFit, fit_window
+from roel_service.tracking.follower import (
+    EXPECTED_SURPRISE,
+    MAX_FOLLOWER_COUNT,
+    Follower,
+    cautious_covariance,
+    rivals,
+)
+from roel_service.tracking.locate import EVENT_SCALES_PX, roughly_at
 from roel_service.tracking.motion import MotionState
+
+from .synthetic import WINDOW_US, eyes_on, recording, window_at
 
 CONFIG = TrackConfig()
 
@@ -74,3 +83,26 @@ def test_a_direction_that_one_edge_holds_alone_is_open():
 def test_without_any_event_the_forecast_stays():
     forecast = np.diag(np.square([0.1] * 12))
     np.testing.assert_array_equal(cautious_covariance(forecast, follower(0.0, 1).fit), forecast)
+
+
+def followed(known_m_s):
+    """One window more, the camera having begun to move all of a sudden; known speeds, m/s."""
+    room = recording()
+    eyes, window = eyes_on(room.line_map), window_at(100_000, room.events)
+    start = roughly_at(room.pose(100_000), np.zeros(6), 100_000, CONFIG)
+    one = Follower(fit_window(start, window, eyes.pieces, eyes.view, CONFIG, EVENT_SCALES_PX))
+    speed = one.state.velocity + np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.0])
+    held = one.state.covariance.copy()
+    held[6:] = held[:, 6:] = 0.0
+    held[6:, 6:] = known_m_s**2 * np.eye(6)
+    one.fit = replace(one.fit, state=replace(one.state, velocity=speed, covariance=held))
+    one.follow(window_at(100_000 + WINDOW_US, room.events), eyes, CONFIG)
+    return one
+
+
+def test_a_state_that_surprises_is_less_certain():
+    calm, surprised = followed(0.5), followed(0.01)
+    assert calm.fit.surprise < EXPECTED_SURPRISE < surprised.fit.surprise
+    assert np.trace(surprised.state.covariance[3:6, 3:6]) > np.trace(
+        calm.state.covariance[3:6, 3:6]
+    )
