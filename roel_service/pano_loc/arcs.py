@@ -7,7 +7,6 @@ cover the sphere; their ends become rays, and from there on nothing knows of cro
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -19,9 +18,8 @@ from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry import sphere
 from roel_service.geometry.vectors import dot, unit
 from roel_service.pano_loc import arcs_kernels
+from roel_service.pano_loc.side_by_side import side_by_side
 
-# Crops, and poses, are worked on side by side; what takes time does not hold the interpreter's lock.
-THREAD_COUNT = 2
 # OpenCV's LSD at its default scale of 0.8 puts lines this far to the upper left (px).
 LSD_OFFSET_PX = -0.125
 BLUR_PX = 0.7
@@ -118,9 +116,7 @@ def detect_arcs(grey: Array, config: LocalizeConfig) -> PanoramaArcs:
         from_center_px = np.abs(pieces.mean(axis=1) - crop.center_px).max(axis=1)
         return crop.rays(pieces[from_center_px <= crop.center_px - BORDER_PX])
 
-    with ThreadPoolExecutor(THREAD_COUNT) as threads:
-        found = threads.map(pieces_in, crops(grey.shape[1], config.crop_px, TILING))
-        rays = np.concatenate(list(found))
+    rays = np.concatenate(side_by_side(pieces_in, crops(grey.shape[1], config.crop_px, TILING)))
     return whole_arcs(rays[:, 0], rays[:, 1], config)
 
 
@@ -149,17 +145,19 @@ def join_arcs(pieces: PanoramaArcs) -> PanoramaArcs:
     group = arcs_kernels.join(
         pieces.starts, pieces.ends, pieces.normals, JOIN_DISTANCE_RAD, JOIN_GAP_RAD
     )
-    normals = _fitted_normals(pieces, group)
-    # Angles along the circle, from the middle of the group's first and longest piece.
-    first = np.unique(group, return_index=True)[1]
-    ahead = unit(pieces.starts[first] + pieces.ends[first])
-    ahead = unit(ahead - dot(ahead, normals)[:, None] * normals)
+    # Group by group, the longest piece of each first.
+    order = np.argsort(group, kind="stable")
+    pieces, group = pieces.take(order), group[order]
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    middles = unit(pieces.starts + pieces.ends)
+    normals = _fitted_normals(pieces, middles, first)
+    # Angles along the circle, from the middle of the group's longest piece.
+    ahead = unit(middles[first] - dot(middles[first], normals)[:, None] * normals)
     aside = np.cross(normals, ahead)
     rays = np.stack([pieces.starts, pieces.ends], axis=1)
     along_rad = np.arctan2(dot(rays, aside[group, None]), dot(rays, ahead[group, None]))
-    low, high = np.full(len(first), np.pi), np.full(len(first), -np.pi)
-    np.minimum.at(low, group, along_rad.min(axis=1))
-    np.maximum.at(high, group, along_rad.max(axis=1))
+    low = np.minimum.reduceat(along_rad.min(axis=1), first)
+    high = np.maximum.reduceat(along_rad.max(axis=1), first)
     short = high - low < np.pi
     starts, ends = (
         np.cos(angle)[:, None] * ahead + np.sin(angle)[:, None] * aside for angle in (low, high)
@@ -167,14 +165,18 @@ def join_arcs(pieces: PanoramaArcs) -> PanoramaArcs:
     return PanoramaArcs.between(starts[short], ends[short])
 
 
-def _fitted_normals(pieces: PanoramaArcs, group: IntArray) -> FloatArray:
-    """(G, 3) normals of the circles that fit the pieces of each group best."""
-    middle = unit(pieces.starts + pieces.ends)
-    scatter = np.zeros((group.max() + 1, 3, 3))
+def _fitted_normals(pieces: PanoramaArcs, middles: FloatArray, first: IntArray) -> FloatArray:
+    """(G, 3) normals of the circles that fit the pieces of each group best.
+
+    Args:
+        pieces: group by group.
+        middles: (A, 3) unit, of the pieces.
+        first: (G,) index of the first piece of each group.
+    """
     # Simpson's rule for the integral of q q' along the arc.
-    for rays, share in ((pieces.starts, 1.0), (middle, 4.0), (pieces.ends, 1.0)):
-        weighted = (share * pieces.length_rad)[:, None, None]
-        np.add.at(scatter, group, weighted * rays[:, :, None] * rays[:, None, :])
+    rays = np.stack([pieces.starts, middles, pieces.ends], axis=1)
+    weighted = (pieces.length_rad[:, None] * np.array([1.0, 4.0, 1.0]))[:, :, None] * rays
+    scatter = np.add.reduceat(weighted.transpose(0, 2, 1) @ rays, first, axis=0)
     return np.asarray(np.linalg.eigh(scatter)[1][:, :, 0])
 
 

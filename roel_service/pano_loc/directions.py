@@ -86,7 +86,8 @@ def _strongest(
     """
     found: list[FloatArray] = []
     votes = length.copy()
-    support = _vote(deviation(candidates)) if len(candidates) else np.empty((len(length), 0))
+    # Which candidate is best needs no more than single precision.
+    support = _vote(deviation(candidates).astype(np.float32))
     while len(candidates) and len(found) < max_count:
         direction = candidates[np.argmax(votes @ support)]
         for _ in range(ROUND_COUNT):
@@ -101,8 +102,8 @@ def _strongest(
     return np.array(found).reshape(-1, 3)
 
 
-def _vote(sine: Array) -> FloatArray:
-    return np.asarray(np.exp(-0.5 * (sine / np.sin(VOTE_WIDTH_RAD)) ** 2))
+def _vote(sine: Array) -> Array:
+    return np.asarray(np.exp(-0.5 * (sine / np.float32(np.sin(VOTE_WIDTH_RAD))) ** 2))
 
 
 def class_of(directions: FloatArray, shared: FloatArray) -> Array:

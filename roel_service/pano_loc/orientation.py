@@ -113,28 +113,26 @@ def _distinct(
     rotations: FloatArray, explained: FloatArray, config: LocalizeConfig
 ) -> tuple[FloatArray, FloatArray]:
     """The best rotations, each the only one of its neighbourhood, best first."""
-    order = np.argsort(-explained, kind="stable")
+    left = np.argsort(-explained, kind="stable")
     kept: list[int] = []
-    for index in order:
-        if len(kept) == config.max_rotation_count:
-            break
-        turned_rad = rotation_angle(rotations[kept] @ rotations[index].T)
-        if not (turned_rad < SAME_ROTATION_RAD).any():
-            kept.append(int(index))
+    while len(left) and len(kept) < config.max_rotation_count:
+        kept.append(int(left[0]))
+        turned_rad = rotation_angle(rotations[left] @ rotations[left[0]].T)
+        left = left[turned_rad >= SAME_ROTATION_RAD]
     return rotations[kept], explained[kept]
 
 
 def _refined(rotations: FloatArray, arcs: PanoramaArcs, shared: FloatArray) -> FloatArray:
     """Rotations after robust least squares of (R n) . d over arcs n and their directions d."""
     for width_rad in REFINE_WIDTHS_RAD:
-        world = np.einsum("rij,aj->rai", rotations, arcs.normals)
+        world = arcs.normals @ rotations.transpose(0, 2, 1)
         sine = world @ shared.T
         nearest = np.abs(sine).argmin(axis=2)
         residual = np.take_along_axis(sine, nearest[:, :, None], axis=2)[:, :, 0]
         jacobian = np.cross(world, shared[nearest])
         weight = arcs.length_rad / (1.0 + (residual / np.sin(width_rad)) ** 2) ** 2
-        H = np.einsum("ra,rai,raj->rij", weight, jacobian, jacobian)
-        g = np.einsum("ra,ra,rai->ri", weight, residual, jacobian)
+        weighted = (weight[:, :, None] * jacobian).transpose(0, 2, 1)
+        H, g = weighted @ jacobian, (weighted @ residual[:, :, None])[:, :, 0]
         damping = 1e-6 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         step = -np.linalg.solve(H + damping, g[:, :, None])[:, :, 0]
         rotations = rotation_from_vector(step) @ rotations

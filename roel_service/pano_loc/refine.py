@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from roel_service.arrays import Array, FloatArray
 from roel_service.geometry.se3 import SE3, rotation_angle
 from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import refine_kernels
-from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
+from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.coverage import (
     CROWD_REACH_RAD,
     GATE_RAD,
@@ -21,6 +19,7 @@ from roel_service.pano_loc.coverage import (
 )
 from roel_service.pano_loc.prepare import PreparedMap
 from roel_service.pano_loc.search import Candidates
+from roel_service.pano_loc.side_by_side import side_by_side
 from roel_service.pano_loc.sight_kernels import Samples
 
 # Least squares: distance of samples, gate between arc and line, kernel width of each iteration.
@@ -104,10 +103,7 @@ def _weighed(
         shown = covered(modes.poses[index], samples, sides, lines)
         return two_way_score(float(modes.score[index]), shown)
 
-    with ThreadPoolExecutor(THREAD_COUNT) as threads:
-        return Candidates(
-            poses=modes.poses, score=np.array(list(threads.map(score, range(len(modes)))))
-        )
+    return Candidates(poses=modes.poses, score=np.array(side_by_side(score, range(len(modes)))))
 
 
 def distinct(candidates: Candidates, max_count: int, share: float = 1.0) -> Candidates:
@@ -163,8 +159,7 @@ def _refined(
         )
         return SE3(rotation=rotation, translation=place), explained(samples, off, crowd)
 
-    with ThreadPoolExecutor(THREAD_COUNT) as threads:
-        found = list(threads.map(refined, (candidates.poses[i] for i in range(len(candidates)))))
+    found = side_by_side(refined, (candidates.poses[i] for i in range(len(candidates))))
     return Candidates(
         poses=SE3(
             rotation=np.array([pose.rotation for pose, _ in found]).reshape(-1, 3, 3),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,15 +10,19 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
-from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
+from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.prepare import BEARING_COUNT, VIEW_LINE_COUNT, PreparedMap
+from roel_service.pano_loc.side_by_side import side_by_side
 from roel_service.pano_loc.views import (
+    BEYOND_CHANCE,
+    BY_LIKELIHOOD,
     CLAIM_BEARING_COUNT,
-    Pane,
+    Strokes,
     agreement,
+    best_place,
     pane_of,
-    views_around,
+    strokes_of,
     views_from,
 )
 
@@ -33,8 +37,7 @@ OUTLINED_SHARE, MIN_OUTLINED_COUNT = 0.06, 150
 PLACES_PER_ROTATION = 6
 SUPPRESSION_M = 0.5
 CONSIDERED_PLACE_COUNT = 60
-# Beyond chance, and by likelihood: the columns of `agreement`.
-RANKINGS = (0, 1)
+RANKINGS = (BEYOND_CHANCE, BY_LIKELIHOOD)
 # Rounds around the best: the share of the candidates that takes part, how much finer the grid is, and
 # in how many bearings a line hides others: few where lines are to tell the place exactly.
 ROUNDS = ((1.0, 3, CLAIM_BEARING_COUNT), (0.35, 3, CLAIM_BEARING_COUNT), (0.35, 9, 1))
@@ -110,22 +113,22 @@ def coarse_candidates(
     a prior, places within its reach are tried.
     """
     candidate_count = config.candidate_count / len(RANKINGS)
+    frames = prepared.lines.frames
+    strokes = side_by_side(lambda rotation: strokes_of(arcs, rotation, frames), rotations)
     if prior is None:
         step_m = prepared.step_m
         candidate_count *= max(1.0, len(prepared.places) / ROOM_PLACE_COUNT)
-        places, scores = _everywhere(arcs, prepared, rotations)
+        places, scores = _everywhere(prepared, strokes)
     else:
         step_m = PRIOR_STEP_M
         candidate_count *= PRIOR_CANDIDATE_SHARE
-        places, scores = _within_reach(arcs, prepared, rotations, prior)
+        places, scores = _within_reach(prepared, strokes, prior)
     found = []
     for kind in RANKINGS:
         seeds = _best_of_all(places, scores[:, :, kind])
         for share, finer, claim_bearing_count in ROUNDS:
             seeds = seeds.best(max(1, round(share * candidate_count)))
-            seeds = _moved(
-                seeds, kind, arcs, prepared, rotations, step_m / finer, claim_bearing_count
-            )
+            seeds = _moved(seeds, kind, prepared, strokes, step_m / finer, claim_bearing_count)
         found.append(seeds)
     rotation = np.concatenate([seeds.rotation for seeds in found])
     poses = SE3(
@@ -135,33 +138,30 @@ def coarse_candidates(
     return Candidates(poses=poses, score=np.concatenate([_ranks(seeds.score) for seeds in found]))
 
 
-def _everywhere(
-    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def _everywhere(prepared: PreparedMap, strokes: Sequence[Strokes]) -> tuple[FloatArray, FloatArray]:
     """(R, C, 3) places that agree best with the widest lines, and their (R, C, 2) `agreement`."""
-    panes = _panes(arcs, prepared, rotations, prepared.step_m)
-    outline = agreement(prepared.outline, panes)
     count = max(MIN_OUTLINED_COUNT, round(OUTLINED_SHARE * len(prepared.places)))
     count = min(count, len(prepared.places))
-    chosen = np.argpartition(-outline, count - 1, axis=1)[:, :count].reshape(len(panes), -1)
-    return prepared.places[chosen], agreement(prepared.views, panes, chosen)
+
+    def outlined(turned: Strokes) -> tuple[FloatArray, FloatArray]:
+        pane = pane_of(turned, prepared.step_m, BEARING_COUNT)
+        outline = agreement(prepared.outline, pane)
+        chosen = np.argpartition(-outline, count - 1, axis=0)[:count].ravel()
+        return prepared.places[chosen], agreement(prepared.views, pane, chosen)
+
+    places, scores = zip(*side_by_side(outlined, strokes), strict=True)
+    return np.stack(places), np.stack(scores)
 
 
 def _within_reach(
-    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray, prior: PosePrior
+    prepared: PreparedMap, strokes: Sequence[Strokes], prior: PosePrior
 ) -> tuple[FloatArray, FloatArray]:
     """(R, C, 3) places near a first one, and their (R, C, 2) `agreement`."""
     places = _ball(prior.reach_m, PRIOR_STEP_M) + prior.T_world_picture.translation
     views = views_from(prepared.lines, places, BEARING_COUNT, VIEW_LINE_COUNT)
-    scores = agreement(views, _panes(arcs, prepared, rotations, PRIOR_STEP_M))
-    return np.broadcast_to(places, (len(rotations), *places.shape)), scores
-
-
-def _panes(
-    arcs: PanoramaArcs, prepared: PreparedMap, rotations: FloatArray, step_m: float
-) -> list[Pane]:
-    frames = prepared.lines.frames
-    return [pane_of(arcs, rotation, frames, step_m, BEARING_COUNT) for rotation in rotations]
+    panes = [pane_of(turned, PRIOR_STEP_M, BEARING_COUNT) for turned in strokes]
+    scores = np.stack([agreement(views, pane) for pane in panes])
+    return np.broadcast_to(places, (len(strokes), *places.shape)), scores
 
 
 def _ranks(score: FloatArray) -> FloatArray:
@@ -193,9 +193,8 @@ def _best_apart(places: FloatArray, score: FloatArray) -> list[int]:
 def _moved(
     seeds: _Seeds,
     kind: int,
-    arcs: PanoramaArcs,
     prepared: PreparedMap,
-    rotations: FloatArray,
+    strokes: Sequence[Strokes],
     step_m: float,
     claim_bearing_count: int,
 ) -> _Seeds:
@@ -204,24 +203,21 @@ def _moved(
     around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
     places, scores = seeds.places.copy(), seeds.score.copy()
 
-    def move(index: int) -> None:
+    def move(rotation: int) -> None:
         """Those of one orientation, in place."""
-        pane = pane_of(arcs, rotations[index], prepared.lines.frames, step_m, FINE_BEARING_COUNT)
-        for member in np.flatnonzero(seeds.rotation == index):
-            views = views_around(
+        pane = pane_of(strokes[rotation], step_m, FINE_BEARING_COUNT)
+        for member in np.flatnonzero(seeds.rotation == rotation):
+            best, scores[member] = best_place(
                 prepared.lines,
                 places[member] + around,
-                FINE_BEARING_COUNT,
                 FINE_LINE_COUNT,
                 claim_bearing_count,
+                pane,
+                kind,
             )
-            score = agreement(views, [pane])[0, :, kind]
-            best = int(score.argmax())
             places[member] += around[best]
-            scores[member] = score[best]
 
-    with ThreadPoolExecutor(THREAD_COUNT) as threads:
-        list(threads.map(move, np.unique(seeds.rotation)))
+    side_by_side(move, np.unique(seeds.rotation))
     return _Seeds(rotation=seeds.rotation, places=places, score=scores)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ import numpy as np
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3, rotation_angle
-from roel_service.pano_loc.arcs import THREAD_COUNT, PanoramaArcs
+from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.coverage import (
     CROWD_REACH_RAD,
     GATE_RAD,
@@ -29,6 +28,7 @@ from roel_service.pano_loc.refine import (
 )
 from roel_service.pano_loc.refine_kernels import CUTOFF_WIDTHS, normal_equations
 from roel_service.pano_loc.search import Candidates
+from roel_service.pano_loc.side_by_side import side_by_side
 from roel_service.pano_loc.sight_kernels import Pairs, Samples, Sight, match_rays, near, see
 from roel_service.scene.results import (
     LocalizationStatus,
@@ -110,8 +110,7 @@ def hypotheses(
             map_index=map_index,
         )
 
-    with ThreadPoolExecutor(THREAD_COUNT) as threads:
-        return tuple(threads.map(weighed, range(len(candidates))))
+    return tuple(side_by_side(weighed, range(len(candidates))))
 
 
 def judge(searched: Sequence[Found], arcs: PanoramaArcs, config: LocalizeConfig) -> PanoLocResult:

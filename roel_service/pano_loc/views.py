@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,11 +22,11 @@ MIN_SHARE = 0.03
 CLASS_SINE = np.sin(np.deg2rad(4.0))
 # Directions of arcs and of map lines are off by so much.
 DIRECTION_SLACK_RAD = np.deg2rad(1.0)
-# Places of which all lines are compared at once.
-CHUNK_PLACE_COUNT = 256
 # Where lines crowd, arcs lie on some of them by chance: of what takes up the same steps of so many
 # bearings, the widest line alone counts by likelihood.
 CLAIM_BEARING_COUNT = 2
+# Columns of `agreement`.
+BEYOND_CHANCE, BY_LIKELIHOOD = 0, 1
 # At this distance a picture is painted wide enough for a quarter of a cell of places.
 SLACK_DISTANCE_M = 1.0
 
@@ -97,28 +96,8 @@ def views_from(
     Lines of other rooms are far, and take up little.
     """
     inside = _inside(lines, places)
-    chosen = np.concatenate(
-        [
-            widest(lines, inside[first : first + CHUNK_PLACE_COUNT], line_count)
-            for first in range(0, len(places), CHUNK_PLACE_COUNT)
-        ]
-        or [np.empty((0, line_count), np.int64)]
-    )
-    return _views_of(lines, inside, chosen, bearing_count, CLAIM_BEARING_COUNT)
-
-
-def views_around(
-    lines: ClassedLines,
-    places: FloatArray,
-    bearing_count: int,
-    line_count: int,
-    claim_bearing_count: int,
-) -> Views:
-    """The same from (T, 3) places around one, whose lines they share."""
-    inside = _inside(lines, places)
-    middle = inside.mean(axis=0, keepdims=True)
-    chosen = np.repeat(widest(lines, middle, line_count), len(places), axis=0)
-    return _views_of(lines, inside, chosen, bearing_count, claim_bearing_count)
+    chosen = views_kernels.widest(lines.feet, lines.which, inside, line_count)
+    return _views_of(lines, inside, chosen, bearing_count)
 
 
 def _inside(lines: ClassedLines, places: FloatArray) -> FloatArray:
@@ -126,25 +105,12 @@ def _inside(lines: ClassedLines, places: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.einsum("kij,tj->tki", lines.frames, places))
 
 
-def widest(lines: ClassedLines, inside: FloatArray, count: int) -> IntArray:
-    """(T, C) lines that take up most of the sphere, seen from (T, K, 3) places, widest first."""
-    span_rad = views_kernels.spans(lines.feet, lines.which, inside)
-    count = min(count, span_rad.shape[1])
-    chosen = np.argpartition(-span_rad, max(count - 1, 0), axis=1)[:, :count]
-    order = np.argsort(-np.take_along_axis(span_rad, chosen, axis=1), axis=1, kind="stable")
-    return np.asarray(np.take_along_axis(chosen, order, axis=1))
-
-
 def _views_of(
-    lines: ClassedLines,
-    inside: FloatArray,
-    chosen: IntArray,
-    bearing_count: int,
-    claim_bearing_count: int,
+    lines: ClassedLines, inside: FloatArray, chosen: IntArray, bearing_count: int
 ) -> Views:
     """What (T, M) chosen lines look like from (T, K, 3) places."""
     slots, words, fronts, kinds = views_kernels.views(
-        lines.feet, lines.which, inside, chosen, bearing_count, claim_bearing_count, SHELL_ENDS_M
+        lines.feet, lines.which, inside, chosen, bearing_count, CLAIM_BEARING_COUNT, SHELL_ENDS_M
     )
     everything = np.full(len(lines.frames) * bearing_count, ~np.uint64(0))
     sizes, front_sizes = (
@@ -167,91 +133,149 @@ def _sizes(slots: Array, words: Array, kinds: Array, shown: Array, class_count: 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Strokes:
+    """Arcs of a picture in one orientation, about the directions of their classes.
+
+    Attributes:
+        frames: (K, 3, 3) of the classes.
+        which: (A,) class, -1 for none.
+        bearings: (A,) rad.
+        words: (A,) uint64 elevations.
+        sides: (V, 3) of the picture, world.
+    """
+
+    frames: FloatArray
+    which: IntArray
+    bearings: FloatArray
+    words: Array
+    sides: FloatArray
+
+
+def strokes_of(arcs: PanoramaArcs, rotation: FloatArray, frames: FloatArray) -> Strokes:
+    """A picture turned into the world by a (3, 3) rotation."""
+    which, bearings, words = views_kernels.strokes(
+        arcs.starts, arcs.ends, arcs.normals, rotation, frames, CLASS_SINE
+    )
+    return Strokes(
+        frames=frames,
+        which=which,
+        bearings=bearings,
+        words=words,
+        sides=arcs.sides @ rotation.T,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Pane:
-    """A picture in one orientation.
+    """A picture in one orientation, painted.
 
     Attributes:
         words: (K, B) uint64, painted elevations.
-        shown: (K, B) uint64, what the picture shows; None if it shows everything.
+        shown: (K, B) uint64, what the picture shows.
+        shows_everything: whether it does.
         share: (N,) chance that a step of each kind of line is painted.
         gain, loss: (N,) log-likelihood ratios of a step that is painted, and of one that is not.
     """
 
     words: Array
-    shown: Array | None
+    shown: Array
+    shows_everything: bool
     share: FloatArray
     gain: FloatArray
     loss: FloatArray
 
 
-def pane_of(
-    arcs: PanoramaArcs, rotation: FloatArray, frames: FloatArray, step_m: float, bearing_count: int
-) -> Pane:
-    """A picture turned into the world, painted for places that are a step apart."""
+def pane_of(strokes: Strokes, step_m: float, bearing_count: int) -> Pane:
+    """Strokes painted for places that are a step apart."""
     words = views_kernels.paint(
-        arcs.starts @ rotation.T,
-        arcs.ends @ rotation.T,
-        arcs.normals @ rotation.T,
-        frames,
-        CLASS_SINE,
-        DIRECTION_SLACK_RAD + 0.25 * step_m / SLACK_DISTANCE_M,
+        strokes.which,
+        strokes.bearings,
+        strokes.words,
+        len(strokes.frames),
         bearing_count,
+        DIRECTION_SLACK_RAD + 0.25 * step_m / SLACK_DISTANCE_M,
     )
-    shown = None
-    if len(arcs.sides):
-        shown = views_kernels.paint_view(arcs.sides @ rotation.T, frames, bearing_count)
-    everything = np.full_like(words, ~np.uint64(0))
-    painted = views_kernels.painted_share(words, everything if shown is None else shown)
-    share = np.maximum(painted, MIN_SHARE)[:, None]
+    shown = np.full_like(words, ~np.uint64(0))
+    if len(strokes.sides):
+        shown = views_kernels.paint_view(strokes.sides, strokes.frames, bearing_count)
+    share = np.maximum(views_kernels.painted_share(words, shown), MIN_SHARE)[:, None]
     seen = SEEN_CHANCE * np.exp(-SHELL_MIDDLES_M / SEEN_REACH_M)
     gain = np.log((seen + (1.0 - seen) * share) / share)
     loss = np.broadcast_to(np.log(1.0 - seen), gain.shape)
     return Pane(
         words=words,
         shown=shown,
+        shows_everything=len(strokes.sides) == 0,
         share=np.repeat(share[:, 0], len(seen)),
         gain=gain.ravel(),
         loss=loss.ravel(),
     )
 
 
-def agreement(views: Views, panes: Sequence[Pane], chosen: IntArray | None = None) -> FloatArray:
-    """(R, C, 2) scores of places in R orientations: beyond chance, and by likelihood.
+def agreement(views: Views, pane: Pane, chosen: IntArray | None = None) -> FloatArray:
+    """(C, 2) scores of places in one orientation: beyond chance, and by likelihood.
 
     The first is right where all lines can be seen, the second where walls hide most of them.
 
     Args:
         views: of T places.
-        panes: of R orientations.
-        chosen: (R, C) places that are asked for in each orientation; None for all.
+        pane: the picture.
+        chosen: (C,) places that are asked for; None for all.
     """
     if chosen is None:
-        chosen = np.broadcast_to(np.arange(len(views.words)), (len(panes), len(views.words)))
-    share, gain, loss = (
-        np.stack([getattr(pane, name) for pane in panes]) for name in ("share", "gain", "loss")
-    )
-    words = np.stack([pane.words.ravel() for pane in panes])
+        chosen = np.arange(len(views.words))
     total = views_kernels.painted_steps(
         views.slots,
         views.words,
         views.fronts,
         views.kinds,
-        words,
-        gain - loss,
-        np.ascontiguousarray(chosen),
+        pane.words.ravel(),
+        pane.gain - pane.loss,
+        chosen,
     )
-    every = [_sizes_in(views, pane) for pane in panes]
-    sizes = [size[places] for (size, _), places in zip(every, chosen, strict=True)]
-    fronts = [size[places] for (_, size), places in zip(every, chosen, strict=True)]
-    expected = np.stack([size @ column for size, column in zip(sizes, share, strict=True)])
-    missed = np.stack([size @ column for size, column in zip(fronts, loss, strict=True)])
-    size = np.maximum(np.stack([size.sum(axis=1) for size in sizes]), 1.0)
-    return np.stack([(total[:, :, 0] - expected) / np.sqrt(size), total[:, :, 1] + missed], axis=2)
+    sizes, front_sizes = (sizes[chosen] for sizes in _sizes_in(views, pane))
+    beyond_chance = total[:, 0] - sizes @ pane.share
+    beyond_chance /= np.sqrt(np.maximum(sizes.sum(axis=1), 1.0))
+    return np.stack([beyond_chance, total[:, 1] + front_sizes @ pane.loss], axis=1)
+
+
+def best_place(
+    lines: ClassedLines,
+    places: FloatArray,
+    line_count: int,
+    claim_bearing_count: int,
+    pane: Pane,
+    kind: int,
+) -> tuple[int, float]:
+    """Which of (T, 3) places, m, around one agrees best, and its score.
+
+    Args:
+        lines: of the map.
+        places: which share the lines that are widest from their middle.
+        line_count: that are compared.
+        claim_bearing_count: of what takes up the same steps of so many bearings, the widest line
+            alone counts by likelihood.
+        pane: the picture.
+        kind: column of `agreement`.
+    """
+    index, score = views_kernels.best_place(
+        lines.feet,
+        lines.which,
+        _inside(lines, places),
+        line_count,
+        claim_bearing_count,
+        SHELL_ENDS_M,
+        pane.words,
+        pane.shown,
+        np.stack([pane.share, pane.gain - pane.loss, pane.loss]),
+        kind == BY_LIKELIHOOD,
+    )
+    return int(index), float(score)
 
 
 def _sizes_in(views: Views, pane: Pane) -> tuple[FloatArray, FloatArray]:
     """(T, N) sizes of the parts of lines that a picture shows; all, and those in front."""
-    if pane.shown is None:
+    if pane.shows_everything:
         return views.sizes, views.front_sizes
     shown, class_count = pane.shown.ravel(), len(pane.words)
     return (

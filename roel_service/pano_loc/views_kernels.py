@@ -70,17 +70,51 @@ def _bearing(across: float, aside: float) -> float:
 
 
 @numba.njit(cache=True, nogil=True)
-def spans(feet: FloatArray, which: IntArray, places: FloatArray) -> FloatArray:
-    """(T, L) angles that lines take up, seen from (T, K, 3) places in the axes of each class."""
-    span_rad = np.empty((len(places), len(feet)))
-    for t in range(len(places)):
-        for j in range(len(feet)):
-            k = which[j]
-            across, aside = feet[j, 0] - places[t, k, 0], feet[j, 1] - places[t, k, 1]
-            away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
-            low, high = (feet[j, 2] - places[t, k, 2]) / away, (feet[j, 3] - places[t, k, 2]) / away
-            span_rad[t, j] = _arctan(high) - _arctan(low)
+def spans(feet: FloatArray, which: IntArray, inside: FloatArray) -> FloatArray:
+    """(L,) angles that lines take up, seen from a place, (K, 3) in the axes of each class."""
+    span_rad = np.empty(len(feet))
+    for j in range(len(feet)):
+        k = which[j]
+        across, aside = feet[j, 0] - inside[k, 0], feet[j, 1] - inside[k, 1]
+        away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
+        low, high = (feet[j, 2] - inside[k, 2]) / away, (feet[j, 3] - inside[k, 2]) / away
+        span_rad[j] = _arctan(high) - _arctan(low)
     return span_rad
+
+
+@numba.njit(cache=True, nogil=True)
+def widest(feet: FloatArray, which: IntArray, places: FloatArray, count: int) -> IntArray:
+    """(T, C) lines that take up most of the sphere, seen from (T, K, 3) places, widest first."""
+    count = min(count, len(feet))
+    chosen = np.empty((len(places), count), np.int64)
+    for t in range(len(places)):
+        span_rad = spans(feet, which, places[t])
+        least = np.partition(span_rad, len(feet) - count)[len(feet) - count] if count else np.inf
+        wide = np.flatnonzero(span_rad >= least)
+        chosen[t] = wide[np.argsort(-span_rad[wide], kind="mergesort")][:count]
+    return chosen
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(
+    feet: FloatArray, j: int, inside: FloatArray, k: int, per_rad: float, bearing_count: int
+) -> tuple[int, np.uint64, float]:
+    """Step of the bearing of line j, its elevations, and the distance of its nearest point, m."""
+    across, aside = feet[j, 0] - inside[k, 0], feet[j, 1] - inside[k, 1]
+    low, high = feet[j, 2] - inside[k, 2], feet[j, 3] - inside[k, 2]
+    away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
+    bearing = min(int(_bearing(across, aside) * per_rad), bearing_count - 1)
+    word = _word(_arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD)
+    ahead = max(0.0, low, -high)
+    return bearing, word, np.sqrt(away * away + ahead * ahead)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _shell(distance_m: float, shell_ends_m: FloatArray) -> int:
+    shell = 0
+    while shell < len(shell_ends_m) and distance_m > shell_ends_m[shell]:
+        shell += 1
+    return shell
 
 
 @numba.njit(cache=True, nogil=True)
@@ -121,24 +155,72 @@ def views(
         for m in range(chosen.shape[1]):
             j = chosen[t, m]
             k = which[j]
-            across, aside = feet[j, 0] - places[t, k, 0], feet[j, 1] - places[t, k, 1]
-            low, high = feet[j, 2] - places[t, k, 2], feet[j, 3] - places[t, k, 2]
-            away = max(np.sqrt(across * across + aside * aside), MIN_DISTANCE_M)
-            bearing = min(int(_bearing(across, aside) * per_rad), bearing_count - 1)
-            slots[t, m] = k * bearing_count + bearing
-            words[t, m] = _word(
-                _arctan(low / away) - END_SLACK_RAD, _arctan(high / away) + END_SLACK_RAD
-            )
+            bearing, word, distance_m = _look(feet, j, places[t], k, per_rad, bearing_count)
             claim = k * bearing_count + bearing - bearing % claim_bearing_count
-            fronts[t, m] = words[t, m] & ~claimed[claim]
-            claimed[claim] |= words[t, m]
-            ahead = max(0.0, low, -high)
-            distance_m = np.sqrt(away * away + ahead * ahead)
-            shell = 0
-            while shell < shell_count - 1 and distance_m > shell_ends_m[shell]:
-                shell += 1
-            kinds[t, m] = k * shell_count + shell
+            slots[t, m], words[t, m] = k * bearing_count + bearing, word
+            fronts[t, m] = word & ~claimed[claim]
+            claimed[claim] |= word
+            kinds[t, m] = k * shell_count + _shell(distance_m, shell_ends_m)
     return slots, words, fronts, kinds
+
+
+@numba.njit(cache=True, nogil=True)
+def best_place(
+    feet: FloatArray,
+    which: IntArray,
+    places: FloatArray,
+    line_count: int,
+    claim_bearing_count: int,
+    shell_ends_m: FloatArray,
+    pane: Array,
+    shown: Array,
+    weights: FloatArray,
+    by_likelihood: bool,
+) -> tuple[int, float]:
+    """Which of places close to one another agrees best with a pane, and its score.
+
+    Args:
+        feet, which, claim_bearing_count, shell_ends_m: as `views` has them.
+        places: (T, K, 3) in the axes of each class, m.
+        line_count: that are looked at, those that are widest from the middle.
+        pane, shown: (K, B) what is painted, and what the picture shows.
+        weights: (3, N) of each kind of line: chance that a step is painted; what a painted step in
+            front gains, and what one that is not loses.
+        by_likelihood: which of the two scores.
+    """
+    middle = np.zeros(places.shape[1:])
+    for t in range(len(places)):
+        middle += places[t] / len(places)
+    chosen = widest(feet, which, middle.reshape(1, -1, 3), line_count)[0]
+    bearing_count, shell_count = pane.shape[1], len(shell_ends_m) + 1
+    per_rad = bearing_count / (2.0 * np.pi)
+    claimed = np.zeros(pane.shape, np.uint64)
+    best, best_score = -1, -np.inf
+    for t in range(len(places)):
+        claimed[:] = 0
+        gained, size = 0.0, 0.0
+        for m in range(len(chosen)):
+            j = chosen[m]
+            k = which[j]
+            bearing, word, distance_m = _look(feet, j, places[t], k, per_rad, bearing_count)
+            if by_likelihood:
+                claim = bearing - bearing % claim_bearing_count
+                front = word & ~claimed[k, claim]
+                if front == 0:
+                    continue
+                claimed[k, claim] |= word
+                kind = k * shell_count + _shell(distance_m, shell_ends_m)
+                gained += weights[1, kind] * np.float64(_count(front & pane[k, bearing]))
+                gained += weights[2, kind] * np.float64(_count(front & shown[k, bearing]))
+            else:
+                steps = np.float64(_count(word & shown[k, bearing]))
+                gained += np.float64(_count(word & pane[k, bearing]))
+                gained -= weights[0, k * shell_count] * steps
+                size += steps
+        score = gained if by_likelihood else gained / np.sqrt(max(size, 1.0))
+        if score > best_score:
+            best, best_score = t, score
+    return best, best_score
 
 
 @numba.njit(cache=True, nogil=True)
@@ -152,53 +234,79 @@ def sizes(slots: Array, words: Array, kinds: Array, shown: Array, kind_count: in
 
 
 @numba.njit(cache=True, nogil=True)
-def paint(
+def strokes(
     starts: FloatArray,
     ends: FloatArray,
     normals: FloatArray,
+    rotation: FloatArray,
     frames: FloatArray,
     max_sine: float,
-    slack_rad: float,
-    bearing_count: int,
-) -> Array:
-    """(K, B) uint64 pane of arcs in the world's frame.
+) -> tuple[IntArray, FloatArray, Array]:
+    """(A,) class of each arc, -1 for none; (A,) bearing, rad, and (A,) uint64 elevations.
 
     Args:
-        starts, ends, normals: (A, 3) unit.
+        starts, ends, normals: (A, 3) unit, panorama frame.
+        rotation: (3, 3) R_world_panorama.
         frames: (K, 3, 3) rows are the axes of each class, the last one its direction.
         max_sine: of the angle by which arcs may be off the direction of their class.
-        slack_rad: arcs are painted so far to either side.
-        bearing_count: B.
     """
-    pane = np.zeros((len(frames), bearing_count), np.uint64)
-    per_rad = bearing_count / (2.0 * np.pi)
+    which, bearings = np.full(len(starts), -1, np.int64), np.zeros(len(starts))
+    words = np.zeros(len(starts), np.uint64)
+    turned = np.empty((len(frames), 3, 3))
+    for k in range(len(frames)):
+        turned[k] = frames[k] @ rotation
     for a in range(len(starts)):
-        nx, ny, nz = normals[a]
         least, k = max_sine, -1
         for c in range(len(frames)):
-            sine = abs(nx * frames[c, 2, 0] + ny * frames[c, 2, 1] + nz * frames[c, 2, 2])
+            sine = abs(_along(turned, c, 2, normals, a))
             if sine < least:
                 least, k = sine, c
         if k < 0:
             continue
-        frame = frames[k]
-        first = frame @ starts[a]
-        last = frame @ ends[a]
-        if first[0] * last[0] + first[1] * last[1] <= 0.0:
+        first_x, first_y = _along(turned, k, 0, starts, a), _along(turned, k, 1, starts, a)
+        last_x, last_y = _along(turned, k, 0, ends, a), _along(turned, k, 1, ends, a)
+        if first_x * last_x + first_y * last_y <= 0.0:
             continue  # over the vanishing point, where no line of the class goes
         # The bearing of the circle: ends near the vanishing point have none to speak of.
-        across = frame[1, 0] * nx + frame[1, 1] * ny + frame[1, 2] * nz
-        aside = -(frame[0, 0] * nx + frame[0, 1] * ny + frame[0, 2] * nz)
-        if across * (first[0] + last[0]) + aside * (first[1] + last[1]) < 0.0:
+        across, aside = _along(turned, k, 1, normals, a), -_along(turned, k, 0, normals, a)
+        if across * (first_x + last_x) + aside * (first_y + last_y) < 0.0:
             across, aside = -across, -aside
-        bearing = np.arctan2(aside, across) % (2.0 * np.pi)
-        low = np.arctan2(first[2], np.sqrt(first[0] ** 2 + first[1] ** 2))
-        high = np.arctan2(last[2], np.sqrt(last[0] ** 2 + last[1] ** 2))
-        word = _word(min(low, high), max(low, high))
-        begin = int(np.floor((bearing - slack_rad) * per_rad))
-        end = int(np.floor((bearing + slack_rad) * per_rad))
+        low = np.arctan2(_along(turned, k, 2, starts, a), np.sqrt(first_x**2 + first_y**2))
+        high = np.arctan2(_along(turned, k, 2, ends, a), np.sqrt(last_x**2 + last_y**2))
+        which[a], bearings[a] = k, np.arctan2(aside, across) % (2.0 * np.pi)
+        words[a] = _word(min(low, high), max(low, high))
+    return which, bearings, words
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _along(frames: FloatArray, k: int, axis: int, rays: FloatArray, a: int) -> float:
+    """Coordinate of ray a along an axis of frame k."""
+    return float(
+        frames[k, axis, 0] * rays[a, 0]
+        + frames[k, axis, 1] * rays[a, 1]
+        + frames[k, axis, 2] * rays[a, 2]
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def paint(
+    which: IntArray,
+    bearings: FloatArray,
+    words: Array,
+    class_count: int,
+    bearing_count: int,
+    slack_rad: float,
+) -> Array:
+    """(K, B) uint64 pane of strokes, each painted so far to either side."""
+    pane = np.zeros((class_count, bearing_count), np.uint64)
+    per_rad = bearing_count / (2.0 * np.pi)
+    for a in range(len(which)):
+        if which[a] < 0:
+            continue
+        begin = int(np.floor((bearings[a] - slack_rad) * per_rad))
+        end = int(np.floor((bearings[a] + slack_rad) * per_rad))
         for b in range(begin, end + 1):
-            pane[k, b % bearing_count] |= word
+            pane[which[a], b % bearing_count] |= words[a]
     return pane
 
 
@@ -247,28 +355,25 @@ def painted_steps(
     words: Array,
     fronts: Array,
     kinds: Array,
-    panes: Array,
+    pane: Array,
     gains: FloatArray,
     chosen: IntArray,
 ) -> FloatArray:
-    """(R, C, 2) steps of lines that are painted, and what those in front gain.
+    """(C, 2) steps of lines that are painted, and what those in front gain.
 
     Args:
         slots, words, fronts, kinds: (T, M) of `views`.
-        panes: (R, K B).
-        gains: (R, N) of a step of each kind.
-        chosen: (R, C) places that are asked for in each orientation.
+        pane: (K B,).
+        gains: (N,) of a step of each kind.
+        chosen: (C,) places that are asked for.
     """
-    total = np.zeros((len(panes), chosen.shape[1], 2))
-    for c in range(chosen.shape[1]):
-        for r in range(len(panes)):
-            t = chosen[r, c]
-            steps, gained = 0.0, 0.0
-            for j in range(slots.shape[1]):
-                both = words[t, j] & panes[r, slots[t, j]]
-                if both != 0:
-                    steps += np.float64(_count(both))
-                    ahead = np.float64(_count(both & fronts[t, j]))
-                    gained += gains[r, kinds[t, j]] * ahead
-            total[r, c, 0], total[r, c, 1] = steps, gained
+    total = np.zeros((len(chosen), 2))
+    for c in range(len(chosen)):
+        t = chosen[c]
+        steps, gained = np.uint64(0), 0.0
+        for j in range(slots.shape[1]):
+            both = words[t, j] & pane[slots[t, j]]
+            steps += _count(both)
+            gained += gains[kinds[t, j]] * np.float64(_count(both & fronts[t, j]))
+        total[c, 0], total[c, 1] = np.float64(steps), gained
     return total

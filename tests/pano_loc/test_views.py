@@ -4,12 +4,16 @@ import pytest
 from roel_service.geometry.vectors import unit
 from roel_service.pano_loc import views_kernels
 from roel_service.pano_loc.views import (
+    BEYOND_CHANCE,
+    BY_LIKELIHOOD,
+    CLAIM_BEARING_COUNT,
     agreement,
+    best_place,
     class_frames,
     classed_lines,
     pane_of,
+    strokes_of,
     views_from,
-    widest,
 )
 from tests.pano_loc.rooms import pose, seen_from, segments_of
 
@@ -67,7 +71,7 @@ def test_the_fast_angles_are_angles(lines):
     away = np.hypot(feet[:, 0], feet[:, 1])
     expected = np.arctan(feet[:, 3] / away) - np.arctan(feet[:, 2] / away)
     np.testing.assert_allclose(
-        views_kernels.spans(feet, which, np.zeros((1, 1, 3)))[0], expected, atol=3e-5
+        views_kernels.spans(feet, which, np.zeros((1, 3))), expected, atol=3e-5
     )
 
 
@@ -81,10 +85,10 @@ def test_the_true_place_and_orientation_agree_best(lines):
         lines, np.concatenate([TRUTH.translation[None], others]), BEARING_COUNT, LINE_COUNT
     )
     panes = [
-        pane_of(arcs, rotation, lines.frames, 0.1, BEARING_COUNT)
+        pane_of(strokes_of(arcs, rotation, lines.frames), 0.1, BEARING_COUNT)
         for rotation in (TRUTH.rotation, half_turn)
     ]
-    score = agreement(views, panes)
+    score = np.stack([agreement(views, pane) for pane in panes])
     assert score.shape == (2, len(others) + 1, 2)
     for kind in range(2):
         assert np.unravel_index(score[:, :, kind].argmax(), score.shape[:2]) == (0, 0)
@@ -92,14 +96,31 @@ def test_the_true_place_and_orientation_agree_best(lines):
 
 def test_without_arcs_nothing_agrees(lines):
     arcs = seen_from(TRUTH, segments_of()).take(np.arange(0))
-    pane = pane_of(arcs, TRUTH.rotation, lines.frames, 0.1, BEARING_COUNT)
-    score = agreement(views_from(lines, TRUTH.translation[None], BEARING_COUNT, LINE_COUNT), [pane])
+    pane = pane_of(strokes_of(arcs, TRUTH.rotation, lines.frames), 0.1, BEARING_COUNT)
+    score = agreement(views_from(lines, TRUTH.translation[None], BEARING_COUNT, LINE_COUNT), pane)
     assert (score < 0).all()
 
 
 def test_the_widest_lines_are_those_that_fill_most_of_the_view(lines):
-    inside = (lines.frames @ TRUTH.translation)[None]
-    spans = views_kernels.spans(lines.feet, lines.which, inside)[0]
-    few = widest(lines, inside, 10)[0]
-    np.testing.assert_allclose(spans[few], np.sort(spans)[::-1][:10])
-    assert sorted(widest(lines, inside, 10**4)[0]) == list(range(len(spans)))
+    inside = lines.frames @ TRUTH.translation
+    spans = views_kernels.spans(lines.feet, lines.which, inside)
+
+    def widest(count):
+        return views_kernels.widest(lines.feet, lines.which, inside[None], count)[0]
+
+    np.testing.assert_allclose(spans[widest(10)], np.sort(spans)[::-1][:10])
+    assert sorted(widest(10**4)) == list(range(len(spans)))
+    assert len(widest(0)) == 0
+
+
+@pytest.mark.parametrize("kind", [BEYOND_CHANCE, BY_LIKELIHOOD])
+def test_the_best_of_places_is_that_of_the_best_agreement(lines, kind):
+    arcs = seen_from(TRUTH, segments_of())
+    pane = pane_of(strokes_of(arcs, TRUTH.rotation, lines.frames), 0.1, BEARING_COUNT)
+    places = TRUTH.translation + np.random.default_rng(0).uniform(-0.3, 0.3, (20, 3))
+    score = agreement(views_from(lines, places, BEARING_COUNT, LINE_COUNT), pane)[:, kind]
+    found = best_place(lines, places, LINE_COUNT, CLAIM_BEARING_COUNT, pane, kind)
+    assert found[0] == score.argmax()
+    if kind == BEYOND_CHANCE:
+        # By likelihood it matters which lines are in front, which is told for the middle alone.
+        assert found[1] == pytest.approx(score.max())
