@@ -10,6 +10,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import LocalizeConfig
 from roel_service.geometry.se3 import SE3
+from roel_service.geometry.vectors import norm
 from roel_service.pano_loc.arcs import PanoramaArcs
 from roel_service.pano_loc.hints import PosePrior
 from roel_service.pano_loc.prepare import BEARING_COUNT, VIEW_LINE_COUNT, PreparedMap
@@ -181,13 +182,12 @@ def _best_of_all(places: FloatArray, scores: FloatArray) -> _Seeds:
 
 def _best_apart(places: FloatArray, score: FloatArray) -> list[int]:
     """Indices of the best places, each apart from the better ones."""
-    order = np.argsort(-score, kind="stable")[:CONSIDERED_PLACE_COUNT]
-    near = ((places[order, None] - places[order]) ** 2).sum(axis=2) < SUPPRESSION_M**2
+    left = np.argsort(-score, kind="stable")[:CONSIDERED_PLACE_COUNT]
     kept: list[int] = []
-    for index in range(len(order)):
-        if len(kept) < PLACES_PER_ROTATION and not near[index, kept].any():
-            kept.append(index)
-    return [int(index) for index in order[kept]]
+    while len(left) and len(kept) < PLACES_PER_ROTATION:
+        kept.append(int(left[0]))
+        left = left[norm(places[left] - places[left[0]]) >= SUPPRESSION_M]
+    return kept
 
 
 def _moved(

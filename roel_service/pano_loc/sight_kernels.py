@@ -31,7 +31,6 @@ class Sight(NamedTuple):
         moments_m2: (L,) lengths of start x end.
         directions: (L, 3) unit.
         spans: (L, 3) start - end, m.
-        middles, reach_rad: (L, 3) unit and (L,), of the lines' images, and half their lengths.
         from_start, to_end: (L, 3) unit, normal x start and end x normal: into the line's image.
     """
 
@@ -39,8 +38,6 @@ class Sight(NamedTuple):
     moments_m2: FloatArray
     directions: FloatArray
     spans: FloatArray
-    middles: FloatArray
-    reach_rad: FloatArray
     from_start: FloatArray
     to_end: FloatArray
 
@@ -132,7 +129,7 @@ def see(segments: FloatArray, rotation: FloatArray, place: FloatArray) -> Sight:
     count = len(segments)
     normals, directions, spans = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
     from_start, to_end = np.zeros((count, 3)), np.zeros((count, 3))
-    moments, middles, reach_rad = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
+    moments = np.zeros(count)
     start, end = np.empty(3), np.empty(3)
     for j in range(count):
         near_m = _inside(segments[j, 0], rotation, place, start)
@@ -149,16 +146,10 @@ def see(segments: FloatArray, rotation: FloatArray, place: FloatArray) -> Sight:
         for axis in range(3):
             normals[j, axis] /= moment
             directions[j, axis] = -spans[j, axis] / length_m
-            middles[j, axis] = start[axis] / near_m + end[axis] / far_m
-        # The sum of two unit rays is twice the cosine of half the angle between them.
-        twice_cosine = np.sqrt(dot(middles[j], middles[j]))
-        reach_rad[j] = np.arccos(min(1.0, 0.5 * twice_cosine))
-        for axis in range(3):
-            middles[j, axis] /= twice_cosine
         moments[j] = moment
         _cross_into(normals[j], start, 1.0 / near_m, from_start[j])
         _cross_into(end, normals[j], 1.0 / far_m, to_end[j])
-    return Sight(normals, moments, directions, spans, middles, reach_rad, from_start, to_end)
+    return Sight(normals, moments, directions, spans, from_start, to_end)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -221,6 +212,20 @@ def _marked(alike: Array, found: IntArray) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
+def _set_middle(sight: Sight, j: int, middle: Array) -> float:
+    """Half the length of a line's image, rad, and the unit ray in its middle into `middle`."""
+    nx, ny, nz = sight.normals[j, 0], sight.normals[j, 1], sight.normals[j, 2]
+    # The rays to both ends are from_start x normal and normal x to_end.
+    dx = sight.to_end[j, 0] - sight.from_start[j, 0]
+    dy = sight.to_end[j, 1] - sight.from_start[j, 1]
+    dz = sight.to_end[j, 2] - sight.from_start[j, 2]
+    x, y, z = ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx
+    twice_cosine = max(np.sqrt(x * x + y * y + z * z), 1e-12)
+    middle[0], middle[1], middle[2] = x / twice_cosine, y / twice_cosine, z / twice_cosine
+    return float(np.arccos(min(1.0, 0.5 * twice_cosine)))
+
+
+@numba.njit(cache=True, nogil=True)
 def near(
     sight: Sight,
     samples: Samples,
@@ -246,12 +251,12 @@ def near(
     half_cosine, half_sine = np.cos(half_rad), np.sin(half_rad)
     beyond = -np.sin(np.minimum(samples.reach_rad + END_SLACK_RAD + slack_rad, np.pi / 2))
     normals, directions = sight.normals.astype(np.float32), sight.directions.astype(np.float32)
-    middles, reach = sight.middles.astype(np.float32), np.empty(2, np.float32)
+    middle, reach = np.empty(3, np.float32), np.empty(2, np.float32)
     alike = np.zeros((len(half_rad) + 7) // 8 * 8, np.uint8)
     found = np.empty(len(alike), np.int64)
     around_rad = max_residual_rad + END_SLACK_RAD + slack_rad
     for j in range(len(normals)):
-        _set_reach(sight.reach_rad[j] + around_rad, reach)
+        _set_reach(_set_middle(sight, j, middle) + around_rad, reach)
         _mark_alike(
             samples.columns,
             directions[j],
@@ -259,7 +264,7 @@ def near(
             normals[j],
             min_cosine,
             np.float32(2.0),
-            middles[j],
+            middle,
             reach,
             alike,
         )
@@ -313,6 +318,10 @@ def match_rays(
             continue
         off_m = _dots(samples.middles, a, sight.normals, j)
         off_a = _dots(samples.asides, a, sight.normals, j)
+        outermost = samples.offsets[a]
+        least = samples.cosine[outermost] * abs(off_m) + samples.sine[outermost] * abs(off_a)
+        if least > reach:
+            continue  # the outermost rays, whose sines are -+ the same, are the closest
         start_m = _dots(samples.middles, a, sight.from_start, j)
         start_a = _dots(samples.asides, a, sight.from_start, j)
         end_m = _dots(samples.middles, a, sight.to_end, j)

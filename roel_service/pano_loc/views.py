@@ -222,8 +222,7 @@ def agreement(views: Views, pane: Pane, chosen: IntArray | None = None) -> Float
         pane: the picture.
         chosen: (C,) places that are asked for; None for all.
     """
-    if chosen is None:
-        chosen = np.arange(len(views.words))
+    asked = slice(None) if chosen is None else chosen
     total = views_kernels.painted_steps(
         views.slots,
         views.words,
@@ -231,9 +230,9 @@ def agreement(views: Views, pane: Pane, chosen: IntArray | None = None) -> Float
         views.kinds,
         pane.words.ravel(),
         pane.gain - pane.loss,
-        chosen,
+        np.arange(len(views.words)) if chosen is None else chosen,
     )
-    sizes, front_sizes = (sizes[chosen] for sizes in _sizes_in(views, pane))
+    sizes, front_sizes = (sizes[asked] for sizes in _sizes_in(views, pane))
     beyond_chance = total[:, 0] - sizes @ pane.share
     beyond_chance /= np.sqrt(np.maximum(sizes.sum(axis=1), 1.0))
     return np.stack([beyond_chance, total[:, 1] + front_sizes @ pane.loss], axis=1)
