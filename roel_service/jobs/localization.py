@@ -11,6 +11,7 @@ from roel_service.jobs.preparations import Origin, Preparations
 from roel_service.jobs.questions import LocalizeQuestion, MapFile, StoredFile
 from roel_service.pano_loc.localize import localize_panorama, localize_photograph
 from roel_service.pano_loc.prepare import PreparedMap, prepare_map
+from roel_service.pano_loc.warm import warm_up
 from roel_service.scene.results import PanoLocResult
 from roel_service.v1 import localization_pb2
 from roel_service.wire.localization import localization_to_proto
@@ -27,6 +28,7 @@ def answer(
         PanoramaError: no picture that can be used.
         CorruptionError: a file that is not what its digest says.
     """
+    warm_up()
     start_s = time.perf_counter()
     grey = _decoded(question)
     decoded_s = time.perf_counter()

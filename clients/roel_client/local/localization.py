@@ -87,7 +87,9 @@ def _locator(
         from roel_service.pano_loc.hints import PosePrior
         from roel_service.pano_loc.localize import localize_panorama, localize_photograph
         from roel_service.pano_loc.prepare import prepare_map
+        from roel_service.pano_loc.warm import warm_up
 
+        warm_up()
         prior = None if T_prior is None else PosePrior(T_world_picture=T_prior)
         maps = [prepare_map(line_map, config) for line_map in line_maps]
         if camera is not None and prior is not None:
