@@ -51,7 +51,7 @@ class Views:
     """What a map shows at T places: see `views_kernels`.
 
     Attributes:
-        slots: (T, M) int32 class and bearing.
+        slots: (T, M) uint16 class and bearing.
         words, fronts: (T, M) uint64 elevations; those that wider lines do not take up, too.
         kinds: (T, M) uint8 class and distance.
         sizes, front_sizes: (T, N) steps that lines of each kind take up.
@@ -105,9 +105,7 @@ def _inside(lines: ClassedLines, places: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.einsum("kij,tj->tki", lines.frames, places))
 
 
-def _views_of(
-    lines: ClassedLines, inside: FloatArray, chosen: IntArray, bearing_count: int
-) -> Views:
+def _views_of(lines: ClassedLines, inside: FloatArray, chosen: Array, bearing_count: int) -> Views:
     """What (T, M) chosen lines look like from (T, K, 3) places."""
     slots, words, fronts, kinds = views_kernels.views(
         lines.feet, lines.which, inside, chosen, bearing_count, CLAIM_BEARING_COUNT, SHELL_ENDS_M

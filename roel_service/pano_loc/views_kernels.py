@@ -85,10 +85,10 @@ def spans(feet: FloatArray, which: IntArray, inside: FloatArray) -> FloatArray:
 
 
 @numba.njit(cache=True, nogil=True)
-def widest(feet: FloatArray, which: IntArray, places: FloatArray, count: int) -> IntArray:
-    """(T, C) lines that take up most of the sphere, seen from (T, K, 3) places, widest first."""
+def widest(feet: FloatArray, which: IntArray, places: FloatArray, count: int) -> Array:
+    """(T, C) int32 lines that take up most of the sphere from (T, K, 3) places, widest first."""
     count = min(count, len(feet))
-    chosen = np.empty((len(places), count), np.int64)
+    chosen = np.empty((len(places), count), np.int32)
     for t in range(len(places)):
         span_rad = spans(feet, which, places[t])
         least = np.partition(span_rad, len(feet) - count)[len(feet) - count] if count else np.inf
@@ -124,7 +124,7 @@ def views(
     feet: FloatArray,
     which: IntArray,
     places: FloatArray,
-    chosen: IntArray,
+    chosen: Array,
     bearing_count: int,
     claim_bearing_count: int,
     shell_ends_m: FloatArray,
@@ -143,11 +143,11 @@ def views(
         shell_ends_m: (S - 1,) distances that part the shells.
 
     Returns:
-        (T, M) int32 slots: class and bearing as class B + bearing; (T, M) uint64 elevations, twice:
+        (T, M) uint16 slots: class and bearing as class B + bearing; (T, M) uint64 elevations, twice:
         all, and those in front; and (T, M) uint8 kinds: class and shell of the nearest point as
         class S + shell.
     """
-    slots = np.empty(chosen.shape, np.int32)
+    slots = np.empty(chosen.shape, np.uint16)
     words, fronts = np.empty(chosen.shape, np.uint64), np.empty(chosen.shape, np.uint64)
     kinds = np.empty(chosen.shape, np.uint8)
     per_rad, shell_count = bearing_count / (2.0 * np.pi), len(shell_ends_m) + 1

@@ -64,10 +64,10 @@ def test_the_fast_angles_are_angles(lines):
     feet[:, 3] = feet[:, 2] + np.abs(feet[:, 3])
     which = np.zeros(500, np.int64)
     slots, *_ = views_kernels.views(
-        feet, which, np.zeros((1, 1, 3)), np.arange(500)[None], 10**6, 1, np.array([1.0])
+        feet, which, np.zeros((1, 1, 3)), np.arange(500)[None], 60_000, 1, np.array([1.0])
     )
     expected = np.arctan2(feet[:, 1], feet[:, 0]) % (2 * np.pi)
-    np.testing.assert_allclose((slots[0] + 0.5) * (2 * np.pi / 10**6), expected, atol=3e-5)
+    np.testing.assert_allclose((slots[0] + 0.5) * (2 * np.pi / 60_000), expected, atol=8e-5)
     away = np.hypot(feet[:, 0], feet[:, 1])
     expected = np.arctan(feet[:, 3] / away) - np.arctan(feet[:, 2] / away)
     np.testing.assert_allclose(
