@@ -21,7 +21,7 @@ from roel_service.arrays import FloatArray, IntArray
 from roel_service.config.stages import RefineConfig
 from roel_service.errors import LimitError
 from roel_service.geometry import grassmann, plucker, reprojection
-from roel_service.geometry.se3 import SE3
+from roel_service.geometry.se3 import SE3, skew
 from roel_service.geometry.vectors import dot, norm
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected
@@ -38,8 +38,8 @@ from roel_service.scene.lines import InfiniteLines
 RESIDUALS = ("grassmann", "reprojection")
 # Unknowns that are solved for at once: their normal equations take 512 MiB.
 MAX_UNKNOWN_COUNT = 8192
-# A frame that sees fewer lines keeps its pose: three would do if they were exact.
-MIN_ROW_COUNT = 6
+# A frame that sees fewer lines keeps its pose: nothing would hold it.
+MIN_ROW_COUNT = 3
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 8
 # A step that lowers the cost by less than this share ends the iteration.
@@ -77,29 +77,56 @@ class _State:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Term:
-    """Residuals of S rows: values (S, k), by line (S, k, 4), by pose (S, k, 6), all weighted."""
+    """Residuals of S rows, all weighted.
+
+    Attributes:
+        residual: (S, k).
+        by_line, by_pose: (S, k, 4) and (S, k, 6), the middle of the line being held.
+        by_middle: (S, k, 1) by the middle of the line.
+        middle: where that is, and how it moves; None where no residual depends on it.
+    """
 
     residual: FloatArray
     by_line: FloatArray
     by_pose: FloatArray
+    by_middle: FloatArray
+    middle: _Middles | None = None
 
     def weighted(self, weight: FloatArray) -> _Term:
         """With every row's squares times its (S,) weight."""
-        root = np.sqrt(weight)
-        return _Term(
-            residual=root[:, None] * self.residual,
-            by_line=root[:, None, None] * self.by_line,
-            by_pose=root[:, None, None] * self.by_pose,
+        root = np.sqrt(weight)[:, None, None]
+        return replace(
+            self,
+            residual=root[..., 0] * self.residual,
+            by_line=root * self.by_line,
+            by_pose=root * self.by_pose,
+            by_middle=root * self.by_middle,
         )
 
     def squared(self) -> _Term:
         """One residual a row, the sum of the row's squares."""
         twice = 2.0 * self.residual[:, None, :]
-        return _Term(
+        return replace(
+            self,
             residual=dot(self.residual, self.residual)[:, None],
             by_line=twice @ self.by_line,
             by_pose=twice @ self.by_pose,
+            by_middle=twice @ self.by_middle,
         )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Middles:
+    """Mean arc lengths of the middles of each line's observed intervals.
+
+    Attributes:
+        along_m: (S,) that of each row's line.
+        by_line, by_pose: (S, 1, 4) and (S, 1, 6) how each row's line and pose move it.
+    """
+
+    along_m: FloatArray
+    by_line: FloatArray
+    by_pose: FloatArray
 
 
 def refine_batch(refined: Refined, detected: Detected, config: RefineConfig) -> BatchRefined:
@@ -218,18 +245,27 @@ class _Problem:
             by_line, by_pose = reprojection.end_line_jacobians(segments_px, cameras, U, phi, K)
             v, m = plucker.plucker_from_orthonormal(U, phi)
             distances_px = reprojection.end_line_distances_px(segments_px, cameras, v, m, K)
-            return _Term(residual=distances_px, by_line=by_line, by_pose=by_pose)
+            return _Term(
+                residual=distances_px,
+                by_line=by_line,
+                by_pose=by_pose,
+                by_middle=np.zeros((*distances_px.shape, 1)),
+            )
         views = self._views(state)
         v, m = plucker.plucker_from_orthonormal(U, phi)
-        along_m = self._middles_m(views, v, m)
-        foot = plucker.nearest_to_origin(v, m) + along_m[:, None] * v
+        middle = self._middles(views, U, phi)
+        foot = plucker.nearest_to_origin(v, m) + middle.along_m[:, None] * v
         by_line, by_pose = grassmann.plane_line_jacobians(
-            views.normal, views.centre, U, phi, along_m
+            views.normal, views.centre, U, phi, middle.along_m
         )
+        d = dot(views.normal, foot - views.centre)
+        slope = (1.0 + d * d) ** -1.5 * dot(views.normal, v)
         return _Term(
             residual=grassmann.plane_line_residual(views.normal, views.centre, v, foot),
             by_line=by_line,
             by_pose=by_pose,
+            by_middle=np.stack([np.zeros_like(slope), slope], axis=-1)[..., None],
+            middle=middle,
         )
 
     def _event_term(self, state: _State) -> _Term:
@@ -248,6 +284,7 @@ class _Problem:
             residual=(self.root_forms @ unit[..., None])[..., 0],
             by_line=chain @ by_line,
             by_pose=chain @ by_pose,
+            by_middle=np.zeros((len(size), 3, 1)),
         )
         if self.config.loss == "quartic":
             term = term.squared()
@@ -264,13 +301,29 @@ class _Problem:
         views = views_of(self.observations, frames).take(self.observation)
         return replace(views, centre=views.centre - self.origin[self.line])
 
-    def _middles_m(self, views: Views, v: FloatArray, m: FloatArray) -> FloatArray:
-        """(S,) mean arc length of the middles of each line's observed intervals."""
-        middles = cuts_m(views, v, m)[0].mean(axis=-1)
-        known = np.isfinite(middles)
+    def _middles(self, views: Views, U: FloatArray, phi: FloatArray) -> _Middles:
+        """Of lines that are cut by the planes through the ends N.(x - c) = 0, at x = foot + s v."""
+        v, m = plucker.plucker_from_orthonormal(U, phi)
+        cuts = cuts_m(views, v, m)[0]
+        known = np.isfinite(cuts).all(axis=-1)
+        cuts = np.where(known[:, None], cuts, 0.0)
+        foot = plucker.nearest_to_origin(v, m)
+        view = foot[:, None] + cuts[..., None] * v[:, None] - views.centre[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            normal = views.cut_normal / dot(views.cut_normal, v[:, None])[..., None]
+        normal = np.where(known[:, None, None], normal, 0.0)
+        by_direction, by_moment = plucker.plucker_jacobians(U, phi)
+        by_foot = skew(v) @ by_moment - skew(m) @ by_direction
+        by_line = -normal @ by_foot - cuts[..., None] * (normal @ by_direction)
+        by_pose = np.concatenate([-np.cross(normal, view), normal], axis=-1)
         counts = np.bincount(self.line[known], minlength=self.line_count)
-        sums = np.bincount(self.line[known], middles[known], minlength=self.line_count)
-        return np.asarray((sums / np.maximum(counts, 1))[self.line])
+        share = 1.0 / np.maximum(counts, 1)[self.line]
+        sums = np.bincount(self.line, cuts.mean(axis=-1), minlength=self.line_count)
+        return _Middles(
+            along_m=share * sums[self.line],
+            by_line=share[:, None, None] * by_line.mean(axis=1, keepdims=True),
+            by_pose=share[:, None, None] * by_pose.mean(axis=1, keepdims=True),
+        )
 
     def normal_equations(self, terms: Sequence[_Term]) -> tuple[FloatArray, FloatArray]:
         """(U,) gradient and (U, U) Hessian; unknowns are lines, then all poses but the first."""
@@ -281,14 +334,26 @@ class _Problem:
     def _jacobian(self, term: _Term) -> sparse.csr_array:
         row_count, size = term.residual.shape
         rows = np.arange(row_count * size).reshape(row_count, size, 1)
+        found = self._scattered(rows, row_count * size, term.by_line, term.by_pose)
+        if term.middle is None:
+            return found
+        # A line's middle moves with all poses that see it.
+        line = self.line[:, None, None]
+        moves = self._scattered(line, self.line_count, term.middle.by_line, term.middle.by_pose)
+        shape = (row_count * size, self.line_count)
+        return found + _sparse(rows, line, term.by_middle, shape) @ moves
+
+    def _scattered(
+        self, rows: IntArray, count: int, by_line: FloatArray, by_pose: FloatArray
+    ) -> sparse.csr_array:
+        """(count, U) values by (S, k, 4) lines and (S, k, 6) poses, at (S, k, 1) rows."""
+        shape = (count, 4 * self.line_count + 6 * (len(self.frames) - 1))
         line_columns = 4 * self.line[:, None, None] + np.arange(4)
         first_pose = 4 * self.line_count - 6
         pose_columns = first_pose + 6 * self.frame[:, None, None] + np.arange(6)
-        by_pose = np.where(self.is_held[self.frame][:, None, None], 0.0, term.by_pose)
-        pose_columns = np.maximum(pose_columns, 0)
-        shape = (row_count * size, 4 * self.line_count + 6 * (len(self.frames) - 1))
-        lines = _sparse(rows, line_columns, term.by_line, shape)
-        return lines + _sparse(rows, pose_columns, by_pose, shape)
+        by_pose = np.where(self.is_held[self.frame][:, None, None], 0.0, by_pose)
+        lines = _sparse(rows, line_columns, by_line, shape)
+        return lines + _sparse(rows, np.maximum(pose_columns, 0), by_pose, shape)
 
     def step(
         self, state: _State, gradient: FloatArray, hessian: FloatArray, damping: float
