@@ -44,7 +44,8 @@ ROOMS = """\
 `poses_noisy.txt`, an odometry's drift and jitter, against the truth: root mean square of the position in mm
 after alignment by rotation and translation, and of the orientation in degrees. *exact* is what becomes of
 true poses that are refined all the same. NEES is the error squared in units of the reported covariance, over
-six, in the world of the given poses: 1 is honest. Rooms marked * were looked at when parameters were chosen.
+six, in the world of the given poses: 1 is honest. *s* is the processor time of a refinement, *front end* what of it
+went into finding lines in the events. Rooms marked * were looked at when parameters were chosen.
 """
 
 MAPS = """\
@@ -89,7 +90,8 @@ def _name(row: RoomRow) -> str:
 
 
 def _errors_table(rows: list[RoomRow]) -> str:
-    headings = ("room", "given", "smoothed alone", "refined", "share", "exact", "NEES", "s")
+    errors = ("given", "smoothed alone", "refined", "share", "exact")
+    headings = ("room", *errors, "NEES", "s", "front end")
 
     def told(errors: PoseErrors) -> str:
         return f"{errors.ate_mm:.2f}, {errors.rotation_deg:.3f}"
@@ -107,6 +109,7 @@ def _errors_table(rows: list[RoomRow]) -> str:
                 told(row.exact),
                 f"{row.nees:.2f}",
                 f"{row.seconds:.0f}",
+                "" if row.front_end_s is None else f"{row.front_end_s:.0f}",
             )
             for row in rows
         ],

@@ -305,7 +305,7 @@ class _Problem:
         """Of lines that are cut by the planes through the ends N.(x - c) = 0, at x = foot + s v."""
         v, m = plucker.plucker_from_orthonormal(U, phi)
         cuts = cuts_m(views, v, m)[0]
-        known = np.isfinite(cuts).all(axis=-1)
+        known = np.asarray(np.isfinite(cuts).all(axis=-1))
         cuts = np.where(known[:, None], cuts, 0.0)
         foot = plucker.nearest_to_origin(v, m)
         view = foot[:, None] + cuts[..., None] * v[:, None] - views.centre[:, None]
