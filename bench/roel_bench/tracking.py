@@ -1,8 +1,8 @@
 """A camera followed through rooms that were mapped on another walk: `python -m roel_bench.tracking`.
 
 `follow` begins 20 cm and 10 degrees off and follows the whole walk; `start` does so for a moment, from
-many places of the walk; `jump` leaves out a third of a second of the events, then a second, as if the camera
-had been carried blindfold; `elsewhere` follows the walk in the map of another room. A pose that is told as TRACKING is
+many places of the walk; `silence` leaves out a second of the events; `jump` leaves out a third of a second, then a
+second, also of the clock, as if the camera had been put somewhere else at once; `elsewhere` follows the walk in the map of another room. A pose that is told as TRACKING is
 wrong when it is more than 5 cm or 2 degrees off. Maps are read as `roel map export` writes them (.npz).
 """
 
@@ -40,6 +40,7 @@ WRONG_M, WRONG_DEG = 0.05, 2.0
 FOUND_M, FOUND_DEG = 0.02, 1.0
 START_COUNT, START_US = 10, 600_000
 JUMP_BEGIN_US, JUMP_US = 1_000_000, (300_000, 1_000_000)
+SILENCE_BEGINS_US, SILENCE_US = (1_000_000, 1_500_000), 1_000_000
 ELSEWHERE_US = 2_000_000
 # Events come in pieces of so many.
 PIECE_EVENT_COUNT = 30_000
@@ -67,7 +68,7 @@ class Trial:
         median_deg, median_mm, p95_deg, p95_mm, worst_deg, worst_mm: errors of all poses but lost
             ones; null without any.
         nees: mean of the squared errors against their covariances; 6 where these are honest.
-        found_s: time until a pose was TRACKING and near the truth; after the jump for `jump`.
+        found_s: time until a pose was TRACKING and near the truth; after the cut for `silence` and `jump`.
         processor_ms: processor time of a pose, in the mean.
     """
 
@@ -111,9 +112,17 @@ def farthest_guess(pose: SE3, config: TrackConfig, rng: np.random.Generator) -> 
 
 
 def pieces(
-    events: EventSource, first_us: int, last_us: int, cut_us: tuple[int, int] | None = None
+    events: EventSource,
+    first_us: int,
+    last_us: int,
+    cut_us: tuple[int, int] | None = None,
+    *,
+    clock_stops: bool = False,
 ) -> Iterator[tuple[EventStream, int]]:
-    """Events between two times in small pieces; after a cut they are told as so much earlier.
+    """Events between two times in small pieces, but for those of a cut.
+
+    Args:
+        clock_stops: events after the cut are told as so much earlier.
 
     Yields:
         Events on the clock of the tracker, and how far that clock is behind then.
@@ -127,7 +136,7 @@ def pieces(
                 yield _between(piece, first_us, last_us), 0
                 continue
             yield _between(piece, first_us, cut_us[0]), 0
-            behind_us = cut_us[1] - cut_us[0]
+            behind_us = cut_us[1] - cut_us[0] if clock_stops else 0
             yield _earlier(_between(piece, cut_us[1], last_us), behind_us), behind_us
         if chunk.t_us[-1] >= last_us:
             return
@@ -165,7 +174,7 @@ def trial(
     tracker = PoseTracker(line_map, walk.camera, config, guess, seed)
     told: list[tuple[TrackedPose, int]] = []
     busy_s = 0.0
-    for events, behind_us in pieces(walk.events, *span_us, cut_us):
+    for events, behind_us in pieces(walk.events, *span_us, cut_us, clock_stops=kind == "jump"):
         began_s = time.process_time()
         poses = tracker.push(events)
         busy_s += time.process_time() - began_s
@@ -243,6 +252,10 @@ def trials(walk: Walk, elsewhere: Sequence[tuple[str, LineMap]], kinds: set[str]
         for seed, jump_us in enumerate(JUMP_US):
             cut_us = (begin_us, begin_us + jump_us)
             rows.append(trial(walk, *own, "jump", seed, (first_us, last_us), cut_us))
+    if "silence" in kinds:
+        for seed, begin_us in enumerate(first_us + after_us for after_us in SILENCE_BEGINS_US):
+            cut_us = (begin_us, begin_us + SILENCE_US)
+            rows.append(trial(walk, *own, "silence", seed, (first_us, last_us), cut_us))
     if "elsewhere" in kinds:
         span_us = (first_us, first_us + ELSEWHERE_US)
         for seed, (name, line_map) in enumerate(elsewhere):
@@ -277,7 +290,9 @@ def main() -> None:
         "--walk", action="append", nargs=2, required=True, metavar=("DIR", "MAP.npz")
     )
     parser.add_argument("--elsewhere", action="append", default=[], metavar="MAP.npz")
-    parser.add_argument("--kinds", nargs="+", default=["follow", "start", "jump", "elsewhere"])
+    parser.add_argument(
+        "--kinds", nargs="+", default=["follow", "start", "silence", "jump", "elsewhere"]
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()
     others = [(Path(name).stem, read_exported_map(Path(name))) for name in options.elsewhere]

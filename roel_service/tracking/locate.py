@@ -40,6 +40,8 @@ FITTED_COUNT, APART = 6, 0.15
 SAME_DEG, SAME_M = 0.5, 0.01
 # Points of a seen line are so far apart, in its direction and in time.
 POINT_PX, MOMENTS_S = 2.0, (-0.005, 0.0, 0.005)
+# So many points of seen lines are fitted, and so many of the map's lines that may be in view are scored.
+SAMPLED_COUNT, SCORED_COUNT = 3_000, 200
 # So many cells from any line, nothing is near.
 FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
@@ -73,7 +75,7 @@ def locate(
     if len(lines.polarity) == 0:
         return []
     poses = _search(guess, lines, eyes, config, rng)
-    sampled = _sampled(lines, window.t_us)
+    sampled = _sampled(lines, window.t_us).thinned(SAMPLED_COUNT)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
         for state in (
@@ -159,7 +161,7 @@ def _search(
     focal_px = float(np.sqrt(eyes.view.K[0, 0] * eyes.view.K[1, 1]))
     reach = np.array([np.deg2rad(config.reach_deg)] * 3 + [config.reach_m] * 3)
     cell_px = CELL_SHARE * focal_px
-    points = eyes.pieces.segments.mean(axis=1)
+    points, direction = _scored(guess, eyes, config)
     steps = _ball(TURN_STEP), _ball(SHIFT_STEP)
     tangents = np.array([np.concatenate(pair) for pair in itertools.product(*steps)]) * reach
     spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
@@ -170,7 +172,7 @@ def _search(
             poses.rotation,
             poses.translation,
             points,
-            eyes.pieces.direction,
+            direction,
             eyes.view.K,
             fields,
             cell_px,
@@ -183,6 +185,22 @@ def _search(
             children = (tangents[:, None] + noise).reshape(-1, 6)
             tangents = np.concatenate([tangents, children])
     return [guess.retract(tangent) for tangent in _apart(tangents / reach) * reach]
+
+
+def _scored(guess: SE3, eyes: Eyes, config: TrackConfig) -> tuple[FloatArray, FloatArray]:
+    """(S, 3) middles and directions of the map's pieces that a pose near a guess may see."""
+    view, pieces = eyes.view, eyes.pieces
+    corner = np.hypot(view.width / view.K[0, 0], view.height / view.K[1, 1]) / 2.0
+    half_view = np.arctan(corner) + np.deg2rad(config.reach_deg)
+    middles = pieces.segments.mean(axis=1)
+    # From behind the guess, whatever a camera within reach sees lies within this cone.
+    axis = guess.rotation[:, 2]
+    apex = guess.translation - axis * config.reach_m / np.sin(min(half_view, np.pi / 2))
+    away = middles - apex
+    may_be_seen = away @ axis >= np.cos(half_view) * np.linalg.norm(away, axis=1)
+    chosen = np.flatnonzero(may_be_seen)
+    chosen = chosen[:: max(1, -(-len(chosen) // SCORED_COUNT))]
+    return middles[chosen], pieces.direction[chosen]
 
 
 def _ball(step: float) -> FloatArray:

@@ -16,7 +16,7 @@ from roel_service.config.stages import DetectConfig, FramesConfig, PlaneFitConfi
 from roel_service.geometry import segments
 from roel_service.geometry.projection import normalized_from_pixel
 from roel_service.geometry.se3 import SE3
-from roel_service.mapping.detect import EDLines, detect_lines
+from roel_service.mapping.detect import EDLines, Seeds, detect_lines
 from roel_service.mapping.frames import event_frame
 from roel_service.mapping.plane_fit import FittedLines, fit_space_time_planes
 from roel_service.mapping.representations import event_images
@@ -30,6 +30,8 @@ from roel_service.tracking.pieces import MapPieces
 BLURRED_FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
 BLURRED_DETECT = DetectConfig(window_events_per_pixel=(0.1,))
 SHARP_FRAMES, SHARP_DETECT = FramesConfig(), DetectConfig()
+# So many lines are enough to tell a place, and planes are fitted to no more.
+MAX_LINE_COUNT = 80
 # A turn is taken to be even for so long around a moment.
 EVEN_US = 100_000
 # Speeds of lines are known about so well; a camera turns about so fast.
@@ -93,6 +95,9 @@ def _lines(
         events, t_us, eyes.ideal_px, _turning(t_us, turn_rate), eyes.camera, frames, detect
     )
     seeds = detect_lines(event_images(frame, detect), EDLines(detect), detect)
+    # The longest come first.
+    longest = slice(0, MAX_LINE_COUNT)
+    seeds = Seeds(segments_px=seeds.segments_px[longest], polarity=seeds.polarity[longest])
     # The planes are voted for: nothing is drawn.
     return fit_space_time_planes(seeds, frame, PlaneFitConfig(), np.random.default_rng(0))
 

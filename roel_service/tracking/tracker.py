@@ -27,7 +27,9 @@ from roel_service.tracking.whereabouts import Whereabouts
 # To be found, a pose needs events this far around it; to be followed, those of its interval do.
 FINDING_HALF_US = 25_000
 # A lost pose is looked for in so many intervals at once, and in every so many after that.
-FINDING_AT_ONCE, FINDING_STRIDE = 4, 7
+FINDING_AT_ONCE, FINDING_STRIDE = 2, 10
+# Its turn is looked at in every so many.
+GLIMPSE_STRIDE = 2
 # Without events for so long, the camera may be anywhere within reach.
 MAX_SILENCE_US = 500_000
 
@@ -65,6 +67,8 @@ class PoseTracker:
         self._buffer: EventStream | None = None
         self._next_us = 0
         self._followers: list[Follower] = []
+        # Of a camera that is out of sight, rad/s in its own axes.
+        self._turn_rate = np.zeros(3)
         # Windows since the camera was lost, and since it was known well.
         self._lost_count = self._unsure_count = 0
         self.guess(guess)
@@ -169,10 +173,12 @@ class PoseTracker:
     def _found(self, window: Window, around: EventStream) -> TrackedPose:
         """Look for the camera, now and then; see how it turns, all the time."""
         self._whereabouts.lost(window.t_us)
-        turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
         attempt, self._lost_count = self._lost_count, self._lost_count + 1
+        if attempt % GLIMPSE_STRIDE == 0 or self._is_searched(attempt):
+            self._turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
+        turn_rate = self._turn_rate
         fits: list[WindowFit] = []
-        if attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0:
+        if self._is_searched(attempt):
             sight = look(around, window.t_us, self._eyes, turn_rate)
             place = self._whereabouts.place(window.t_us, attempt, self._rng)
             fits = locate(place, sight, window, self._eyes, self._config, self._rng)
@@ -182,6 +188,10 @@ class PoseTracker:
             return _lost(window, fits[0] if fits else None)
         self._followers = rivals([Follower(fit) for fit in possible])
         return _told(window, PoseStatus.UNCERTAIN, self._followers[0].fit)
+
+    def _is_searched(self, attempt: int) -> bool:
+        """Whether a lost camera is looked for in this window, which takes as long as many others."""
+        return attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0
 
     def _lose(self) -> None:
         self._followers = []

@@ -89,3 +89,30 @@ def test_the_longer_it_is_lost_the_farther_around_is_looked():
         for t_us in (200_000, 2_000_000)
     )
     assert (late > 5.0 * soon).all()
+
+
+def test_a_camera_that_sways_on_its_way_is_expected_where_the_way_leads():
+    turn_rate = np.array([0.0, 1.0, 0.0])
+
+    def on_the_way(t_s):
+        """A pose on a circle of 2 m, walked at 1 rad/s and 2 m/s."""
+        rotation = rotation_from_vector(t_s * turn_rate)
+        return SE3(rotation=rotation, translation=2.0 * (rotation @ [0.0, 0.0, 1.0]))
+
+    whereabouts = Whereabouts(on_the_way(0.0), extent_m=6.0)
+    for t_s in np.arange(0.0, 0.901, WINDOW_S):
+        sways = np.array([0.8, 0.0, 0.0, 0.0, 0.4, 0.0])
+        whereabouts.relied_on(
+            MotionState(
+                t_us=round(1e6 * t_s),
+                T_world_camera=on_the_way(t_s),
+                velocity=sways,
+                covariance=np.eye(12),
+            )
+        )
+    whereabouts.lost(1_700_000)
+    turn_deg, shift_m = far(
+        whereabouts.place(1_700_000, 0, np.random.default_rng(0)), on_the_way(1.7)
+    )
+    assert turn_deg < 3.0
+    assert shift_m < 0.1
