@@ -154,10 +154,11 @@ def views(
     claimed = np.zeros(places.shape[1] * bearing_count, np.uint64)
     for t in range(len(places)):
         claimed[:] = 0
+        inside = places[t]
         for m in range(chosen.shape[1]):
             j = chosen[t, m]
             k = which[j]
-            bearing, word, distance_m = _look(feet, j, places[t], k, per_rad, bearing_count)
+            bearing, word, distance_m = _look(feet, j, inside, k, per_rad, bearing_count)
             claim = k * bearing_count + bearing - bearing % claim_bearing_count
             slots[t, m], words[t, m] = k * bearing_count + bearing, word
             fronts[t, m] = word & ~claimed[claim]
@@ -200,11 +201,12 @@ def best_place(
     best, best_score = -1, -np.inf
     for t in range(len(places)):
         claimed[:] = 0
+        inside = places[t]
         gained, size = 0.0, 0.0
         for m in range(len(chosen)):
             j = chosen[m]
             k = which[j]
-            bearing, word, distance_m = _look(feet, j, places[t], k, per_rad, bearing_count)
+            bearing, word, distance_m = _look(feet, j, inside, k, per_rad, bearing_count)
             if by_likelihood:
                 claim = bearing - bearing % claim_bearing_count
                 front = word & ~claimed[k, claim]
