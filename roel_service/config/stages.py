@@ -314,7 +314,9 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
             `reprojection` (the observed ends' distances from the line's image, as LIMAP does).
         loss: `cauchy`, `squared` (none) or `quartic` (the square of each squared residual: the
             other reading of the published cost).
-        loss_scale_px: residual at which the Cauchy loss starts to bend.
+        loss_scale_px: residual at which the Cauchy loss starts to bend, at the least.
+        loss_scale_medians: the same in medians of the residuals of all inliers, so that it widens
+            where a recording is worse than that; 0 leaves it as it is.
         event_weight: weight of the event term against the line term; its unit follows `residual`.
         max_length_weight_px: observations longer than this weigh no more.
         direction_sigma_deg: how far lines deviate from a direction that many of them share; 0
@@ -330,6 +332,7 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
     loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
     loss_scale_px: float = parameter(0.5, POSITIVE)
+    loss_scale_medians: float = parameter(3.0, NOT_NEGATIVE)
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
     direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))
@@ -349,7 +352,9 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
             `reprojection` (the observed ends' distances from the line's image, as LIMAP does).
         loss: `cauchy`, `squared` (none) or `quartic` (the square of each squared residual: the
             other reading of the published cost).
-        loss_scale_px: residual at which the Cauchy loss starts to bend.
+        loss_scale_px: residual at which the Cauchy loss starts to bend, at the least.
+        loss_scale_medians: the same in medians of the residuals of all inliers, so that it widens
+            where a recording is worse than that; 0 leaves it as it is.
         event_weight: weight of the event term against the line term; its unit follows `residual`.
         event_count_per_line: supporting events used an observation, nearest in time; 0 uses all.
             Events are summed up where lines are found in frames, so that this one is read there.

@@ -1,9 +1,9 @@
 """Least squares over all observations and events of each line.
 
 Paper: "Multi-view Line Optimization", with the poses held fixed. Lines then do not share any
-unknown, and all of them are solved together as a batch of systems of four: damped Gauss-Newton in
-the orthonormal parameterisation, about an own origin for each line (the mean of its cameras), where
-the moment's length is the viewing distance and far from zero.
+unknown but the scale of the robust loss, and all of them are solved together as a batch of systems
+of four: damped Gauss-Newton in the orthonormal parameterisation, about an own origin for each line
+(the mean of its cameras), where the moment's length is the viewing distance and far from zero.
 
 Three costs, see `RefineRoundsConfig.residual`:
 
@@ -249,7 +249,13 @@ class _Problem:
             return np.ones_like(residual_px)
         if self.config.residual == "reprojection":
             residual_px = norm(self._end_distances_px(state))
-        return np.asarray(1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2))
+        return np.asarray(1.0 / (1.0 + (residual_px / self._loss_scale_px(residual_px)) ** 2))
+
+    def _loss_scale_px(self, residual_px: FloatArray) -> float:
+        """Where the loss bends: it follows the residuals of a recording worse than expected."""
+        inlier_px = residual_px[self.inliers(residual_px, loose=False)]
+        median_px = float(np.median(inlier_px)) if inlier_px.size else 0.0
+        return max(self.config.loss_scale_px, self.config.loss_scale_medians * median_px)
 
     def cost(self, state: OrthonormalLines, weight: FloatArray) -> FloatArray:
         """(L,) with fixed (S,) robust weights."""

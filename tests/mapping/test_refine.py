@@ -28,6 +28,7 @@ REPROJECTION = RefineConfig(
     residual="reprojection",
     loss="cauchy",
     loss_scale_px=1.0,
+    loss_scale_medians=0.0,
     event_weight=0.0,
     max_length_weight_px=1e6,
     max_residual_px=20.0,
@@ -108,7 +109,8 @@ class TestExact:
         np.testing.assert_array_equal(found.tracks.observation, exact.tracks.observation)
 
     @RESIDUALS
-    def test_lines_do_not_influence_each_other(self, config):
+    def test_lines_influence_each_other_by_the_scale_of_the_loss_alone(self, config):
+        config = dataclasses.replace(config, loss_scale_medians=0.0)
         noisy = world(noise_px=0.2, event_noise_px=0.2)
         start = perturbed(noisy.lines, 0.005, 0.005)
         together = refined(noisy, start, config=config)
@@ -339,6 +341,30 @@ class TestNoise:
         sharper = dataclasses.replace(config, loss_scale_px=0.2)
         assert line_errors(refined(spoilt, config=sharper).lines, spoilt.segments)[:, 0].max() < (
             robust
+        )
+
+    def test_the_loss_widens_with_the_residuals_of_a_recording(self):
+        sharp = dataclasses.replace(PIXEL, loss_scale_px=0.05, event_weight=0.0)
+        fixed = dataclasses.replace(sharp, loss_scale_medians=0.0)
+        wide = dataclasses.replace(fixed, loss_scale_px=1.0)
+
+        noisy = world(noise_px=0.4)
+        error = {
+            name: np.linalg.norm(
+                line_errors(refined(noisy, config=config).lines, noisy.segments)[:, 0]
+            )
+            for name, config in {"follows": sharp, "fixed": fixed, "wide": wide}.items()
+        }
+        # A loss far below the noise heeds few observations alone.
+        assert error["follows"] < error["fixed"]
+        assert error["follows"] == pytest.approx(error["wide"], rel=0.1)
+
+    def test_the_loss_stays_as_sharp_as_configured_on_good_observations(self):
+        spoilt, _ = self.outlying()
+        config = dataclasses.replace(PIXEL, loss_scale_px=0.35, event_weight=0.0)
+        fixed = dataclasses.replace(config, loss_scale_medians=0.0)
+        np.testing.assert_array_equal(
+            refined(spoilt, config=config).lines.moment, refined(spoilt, config=fixed).lines.moment
         )
 
     def test_the_gate_removes_outliers_and_the_lines_are_exact_again(self):
