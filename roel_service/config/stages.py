@@ -423,11 +423,7 @@ class TrimConfig(Stage, table="trim"):
             end on, do not count (`coverage`).
         end_cluster_px: two candidates this close, at the viewing distance, are one end (`cluster`).
         max_error_m: largest error to expect of an end across the line: its standard deviation for
-            the line's own residual, over the support ratio.
-        max_sigma_m: largest standard deviation of an end across the line, for 1 px of noise.
-        max_rms_px: largest residual of a line.
-        min_support_ratio: frames that saw the line against frames that could have.
-        min_frame_count: frames that saw the line.
+            the line's own residual, over the share of the frames that saw it of those that could.
         overlap_distance_m, overlap_angle_deg: parts this close to a stronger line are cut away; a
             distance of 0 leaves them.
     """
@@ -441,10 +437,6 @@ class TrimConfig(Stage, table="trim"):
     max_foreshortening: float = parameter(5.0, Rule(">= 1", lambda value: value >= 1))
     end_cluster_px: float = parameter(5.0, POSITIVE)
     max_error_m: float = parameter(0.06, POSITIVE)
-    max_sigma_m: float = parameter(UNLIMITED, POSITIVE)
-    max_rms_px: float = parameter(UNLIMITED, POSITIVE)
-    min_support_ratio: float = parameter(0.0, SHARE)
-    min_frame_count: int = parameter(1, POSITIVE)
     overlap_distance_m: float = parameter(0.0, NOT_NEGATIVE)
     overlap_angle_deg: float = parameter(4.0, NOT_NEGATIVE)
 

@@ -20,7 +20,7 @@ from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.refine import PointPrior, Refined, refine_lines
-from roel_service.mapping.trim import SupportedPieces, supported_pieces
+from roel_service.mapping.trim import ObservedPieces, observed_pieces
 
 # Ends of other lines that must name the same depth.
 MIN_WITNESS_COUNT = 2
@@ -57,7 +57,7 @@ def held_at_corners(
     Args:
         refined: lines after their last refinement.
         evidence, frames: of all observations.
-        config: `refine`, and `trim` for which lines count.
+        config: `refine`, and `trim` for where lines end.
     """
     if config.refine.corner_sigma_m == 0.0 or len(refined) == 0:
         return refined
@@ -83,10 +83,10 @@ def corner_prior(
     Args:
         refined: L lines.
         evidence, frames: of all observations.
-        config: `refine.corner_*`, and `trim` for which lines count.
+        config: `refine.corner_*`, and `trim` for where lines end.
     """
     settings = config.refine
-    pieces = supported_pieces(refined, evidence.views, frames, config.trim)
+    pieces = observed_pieces(refined, evidence.views, frames, config.trim)
     held = pieces.sigma_m <= settings.corner_depth_m
     corners = _Corners(point=pieces.ends[held].reshape(-1, 3), line=np.repeat(pieces.line[held], 2))
     reach = settings.corner_distance_px / frames.focal_px
@@ -105,7 +105,7 @@ def corner_prior(
 
 
 def _voices(
-    pieces: SupportedPieces, own: IntArray, corners: _Corners, origin: FloatArray, reach: float
+    pieces: ObservedPieces, own: IntArray, corners: _Corners, origin: FloatArray, reach: float
 ) -> _Voices:
     """Corners that lie along the viewing rays of one line's ends.
 

@@ -27,6 +27,8 @@ from roel_service.scene.results import TrackStatus
 SPAN_COVERAGE_FRACTION = 0.25
 # Strength of a segment is n sqrt(length) / (this + sigma): below it, sigma does not matter.
 SIGMA_FLOOR_M = 0.01
+# Few observations may agree by chance; events lie on whole pixels, and no line is seen better.
+LEAST_NOISE_PX = 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -55,8 +57,8 @@ class _Segments:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SupportedPieces:
-    """Pieces of lines that enough observations bear out.
+class ObservedPieces:
+    """Pieces of lines that were seen, certain or not.
 
     Attributes:
         line: (n,) which line each is a piece of.
@@ -81,33 +83,19 @@ def trim_to_segments(
     dropped = [TrackStatus.TOO_SHORT] * (len(refined) - len(np.unique(pieces.line)))
     sigma_m = _sigma_m(refined, pieces)
     support = _support_ratio(refined, pieces, frames)
-    certain = (sigma_m <= config.max_sigma_m) & (
-        _expected_error_m(sigma_m, refined.rms_px[pieces.line], support) <= config.max_error_m
-    )
-    checks = (
-        (TrackStatus.UNCERTAIN, certain),
-        *_support_checks(refined, pieces, support, config),
-    )
-    good = np.ones(len(pieces.line), dtype=bool)
-    for status, passes in checks:
-        dropped += [status] * int((good & ~passes).sum())
-        good &= passes
-    return _line_map(refined, pieces, sigma_m, good, config), dropped
+    error_m = _expected_error_m(sigma_m, refined.rms_px[pieces.line], support)
+    certain = error_m <= config.max_error_m
+    dropped += [TrackStatus.UNCERTAIN] * int((~certain).sum())
+    return _line_map(refined, pieces, sigma_m, certain, config), dropped
 
 
-def supported_pieces(
+def observed_pieces(
     refined: Refined, views: Views, frames: Frames, config: TrimConfig
-) -> SupportedPieces:
+) -> ObservedPieces:
     """The pieces that would enter the map if they were certain enough."""
     pieces = _pieces(refined, views, frames, config)
-    support = _support_ratio(refined, pieces, frames)
-    good = np.ones(len(pieces.line), dtype=bool)
-    for _, passes in _support_checks(refined, pieces, support, config):
-        good &= passes
-    return SupportedPieces(
-        line=pieces.line[good],
-        ends=_ends(refined, pieces)[good],
-        sigma_m=_sigma_m(refined, pieces)[good],
+    return ObservedPieces(
+        line=pieces.line, ends=_ends(refined, pieces), sigma_m=_sigma_m(refined, pieces)
     )
 
 
@@ -129,18 +117,7 @@ def _expected_error_m(sigma_m: FloatArray, rms_px: FloatArray, support: FloatArr
     Its standard deviation is taken for the line's own noise. Observations that are of no one edge may
     agree with one another all the same, so what few frames saw, of those that could, is trusted less.
     """
-    return sigma_m * rms_px / support
-
-
-def _support_checks(
-    refined: Refined, pieces: _Segments, support: FloatArray, config: TrimConfig
-) -> tuple[tuple[TrackStatus, BoolArray], ...]:
-    """(n,) which pieces the observations bear out, by what they are called that fail."""
-    return (
-        (TrackStatus.POOR_FIT, refined.rms_px[pieces.line] <= config.max_rms_px),
-        (TrackStatus.TOO_FEW_VIEWS, pieces.frame_count >= config.min_frame_count),
-        (TrackStatus.UNSUPPORTED, support >= config.min_support_ratio),
-    )
+    return sigma_m * np.maximum(rms_px, LEAST_NOISE_PX) / support
 
 
 def covered_spans(lines: InfiniteLines, tracks: LineTracks, views: Views) -> FloatArray:
@@ -310,14 +287,14 @@ def _frames_in_view(refined: Refined, pieces: _Segments, frames: Frames) -> IntA
 
 
 def _line_map(
-    refined: Refined, pieces: _Segments, sigma_m: FloatArray, good: BoolArray, config: TrimConfig
+    refined: Refined, pieces: _Segments, sigma_m: FloatArray, certain: BoolArray, config: TrimConfig
 ) -> LineMap:
-    """The good pieces, strongest first, without what lies along a stronger one."""
+    """The certain pieces, strongest first, without what lies along a stronger one."""
     ends = _ends(refined, pieces)
     root_length = np.sqrt(norm(ends[:, 1] - ends[:, 0]))
     strength = pieces.frame_count.astype(np.float64) * root_length / (SIGMA_FLOOR_M + sigma_m)
     order = np.argsort(-strength, kind="stable")
-    order = order[good[order]]
+    order = order[certain[order]]
     segments, source = _without_overlaps(ends[order], config)
     origin = order[source]
     return LineMap(

@@ -23,8 +23,6 @@ class TrackStatus(Enum):
     DIVERGED = "diverged"
     MERGED = "merged"
     UNCERTAIN = "uncertain"
-    POOR_FIT = "poor_fit"
-    UNSUPPORTED = "unsupported"
     TOO_SHORT = "too_short"
 
 

@@ -6,7 +6,7 @@ import pytest
 from roel_service.config.stages import Config, RefineConfig, TrimConfig
 from roel_service.mapping.corners import corner_prior, held_at_corners
 from roel_service.mapping.refine import PointPrior, refine_lines
-from roel_service.mapping.trim import supported_pieces
+from roel_service.mapping.trim import observed_pieces
 from roel_service.scene.lines import LineTracks
 
 from .synthetic import line_errors, world, world_of
@@ -55,7 +55,7 @@ def test_what_is_held_is_certain_to_the_map():
     sample, evidence, refined = seen(HELD)
     held = held_at_corners(refined, evidence, sample.frames, CONFIG)
     before, after = (
-        supported_pieces(lines, evidence.views, sample.frames, CONFIG.trim).sigma_m[2]
+        observed_pieces(lines, evidence.views, sample.frames, CONFIG.trim).sigma_m[2]
         for lines in (refined, held)
     )
     assert after < 0.8 * before
