@@ -96,6 +96,7 @@ def document(results: Results) -> str:
         _peers(report),
         _noise(report),
         _ablation(report),
+        _off_parts(report),
         _paper_ablation(report),
         _plane_fitting(report),
         _detection(report),
@@ -255,30 +256,39 @@ def _noise(report: _Report) -> str:
 
 
 def _ablation(report: _Report) -> str:
-    rows = {v.name: found for v in variants.DEFAULT_ABLATION if (found := report.maps.rows(v.name))}
-    # Means are comparable over the rooms that every variant has been on.
-    scenes = set.intersection(*(set(found) for found in rows.values())) if rows else set[str]()
-    lines = []
-    for variant in variants.DEFAULT_ABLATION:
-        if variant.name in rows:
-            without = [row for scene, row in rows[variant.name].items() if scene in scenes]
-            base = report.maps.rows("default")
-            lost = _lost_percent(without, [row for scene, row in base.items() if scene in scenes])
-            lines.append([*_map_line(variant.name, without), number(lost, 1)])
     text = (
         "One part of the default switched off at a time, mean over rooms. The last column is what the"
-        " part is worth: the share of the IoU at 20 mm that is lost without it. Of the same on six"
-        " tuning rooms, by which parts are kept or go, tells"
-        " [parts that guard](decisions/parts-that-guard.md)."
+        " part is worth: the share of the IoU at 20 mm that is lost without it. How parts were chosen,"
+        " on tuning rooms: [parts that do not raise the IoU](decisions/parts-that-guard.md)."
     )
+    return _section(
+        "What each part is worth", text, _beside_default(report, variants.DEFAULT_ABLATION)
+    )
+
+
+def _off_parts(report: _Report) -> str:
+    text = "The same the other way round: what is off by default, switched on."
+    return _section("What is off", text, _beside_default(report, variants.OFF_BY_DEFAULT))
+
+
+def _beside_default(report: _Report, compared: Sequence[Variant]) -> str:
+    """A row for each variant, with the share of the default's IoU at 20 mm that it loses."""
+    rows = {v.name: found for v in compared if (found := report.maps.rows(v.name))}
+    # Means are comparable over the rooms that every variant has been on.
+    scenes = set.intersection(*(set(found) for found in rows.values())) if rows else set[str]()
+    base = [row for scene, row in report.maps.rows("default").items() if scene in scenes]
+    lines = []
+    for name, found in rows.items():
+        changed = [row for scene, row in found.items() if scene in scenes]
+        lines.append([*_map_line(name, changed), number(_lost_percent(changed, base), 1)])
     headings = ["variant", *MAP_HEADINGS, "IoU 20 lost, %"]
     default = [*_default_line(report, "default", scenes), MISSING]
-    return _section("What each part is worth", text, table(headings, [default, *lines]))
+    return table(headings, [default, *lines])
 
 
-def _lost_percent(without: Sequence[Row], base: Sequence[Row]) -> float | None:
+def _lost_percent(changed: Sequence[Row], base: Sequence[Row]) -> float | None:
     """Share of the IoU at 20 mm that is lost; None where it was not measured."""
-    left, whole = mean(without, "iou_20"), mean(base, "iou_20")
+    left, whole = mean(changed, "iou_20"), mean(base, "iou_20")
     return 100.0 * (1.0 - left / whole) if left is not None and whole else None
 
 

@@ -36,6 +36,11 @@ def _without(what: str, **changes: dict[str, Any]) -> Variant:
     return Variant(name=f"default without {what}", changes=changes)
 
 
+def _with(what: str, **changes: dict[str, Any]) -> Variant:
+    """The default with one thing switched on."""
+    return Variant(name=f"default with {what}", changes=changes)
+
+
 def _refined(changes: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """The same for every refinement: between the rounds, and the last one."""
     return {"refine_rounds": changes, "refine": changes}
@@ -76,8 +81,6 @@ DEFAULT_ABLATION = (
             "inlier_distance_px": 2.0,
         },
     ),
-    _without("density test", plane_fit={"min_density_ratio": 0.0}),
-    _without("occupancy test", plane_fit={"min_occupancy": 0.0}),
     _without("prediction of matches", match_local={"predict": False}),
     _without("re-association", match_global={"method": "none"}),
     _without(
@@ -87,7 +90,6 @@ DEFAULT_ABLATION = (
     _without("rounds of re-association", match_global={"max_distances_px": [1.5]}),
     _without("speed gate", match_global={"max_speed_difference_px_per_ms": UNLIMITED}),
     _without("one side of edges", match_global={"one_side": False}),
-    _without("sharing rule", match_global={"max_shared_fraction": 1.0}),
     _without("event term", **_refined({"event_weight": 0.0})),
     _without("robust loss", **_refined({"loss": "squared"})),
     _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
@@ -95,6 +97,14 @@ DEFAULT_ABLATION = (
     _without("coverage runs (clustered ends)", trim={"method": "cluster"}),
     _without("end-on views left out", trim={"max_foreshortening": UNLIMITED}),
     _without("filter by the expected error", trim={"max_error_m": UNLIMITED}),
+)
+
+# What is off by default, switched on.
+OFF_BY_DEFAULT = (
+    _with("density test", plane_fit={"min_density_ratio": 1.6}),
+    _with("occupancy test", plane_fit={"min_occupancy": 0.6}),
+    _with("sharing rule", match_global={"max_shared_fraction": 0.97}),
+    _with("overlap removal", trim={"overlap_distance_m": 0.012}),
 )
 
 # Curved edges, which the default leaves to its lines.
@@ -217,6 +227,7 @@ PAPER_EVENT_COUNTS = tuple(
 
 MAP_ABLATION = (
     *DEFAULT_ABLATION,
+    *OFF_BY_DEFAULT,
     *PAPER_ABLATION_SINGLES,
     *PAPER_ABLATION,
     *PAPER_READINGS,

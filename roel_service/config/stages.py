@@ -166,8 +166,8 @@ class PlaneFitConfig(Stage, table="plane_fit"):
         min_inlier_count: fewer supporting events give no line.
         max_speed_widths_per_s, speed_count: range and steps of the vote on the normal speed.
         support_bin_px, max_gap_bin_count: the supported run of the line, in bins with few gaps.
-        min_occupancy: share of the run's bins that hold events.
-        min_density_ratio: density of events on the line against beside it.
+        min_occupancy: least share of the run's bins that hold events.
+        min_density_ratio: least density of events on the line against beside it.
         duplicate_distance_px, duplicate_overlap: of two fits this close, the better one stays.
         support_event_count: supporting events kept a line, nearest in time to the frame.
         support_half_window_us: supporting events are no farther in time from the frame.
@@ -186,8 +186,8 @@ class PlaneFitConfig(Stage, table="plane_fit"):
     speed_count: int = parameter(25, Rule("2 to 1000", lambda value: 2 <= value <= 1000))
     support_bin_px: float = parameter(3.0, Rule(">= 0.1", lambda value: value >= 0.1))
     max_gap_bin_count: int = parameter(3, NOT_NEGATIVE)
-    min_occupancy: float = parameter(0.6, SHARE)
-    min_density_ratio: float = parameter(1.6, NOT_NEGATIVE)
+    min_occupancy: float = parameter(0.0, SHARE)
+    min_density_ratio: float = parameter(0.0, NOT_NEGATIVE)
     duplicate_distance_px: float = parameter(1.3, NOT_NEGATIVE)
     duplicate_overlap: float = parameter(0.6, SHARE)
     support_event_count: int = parameter(400, at_most(100_000))
@@ -235,7 +235,8 @@ class MatchGlobalConfig(Stage, table="match_global"):
             the first one serves `sampled`.
         min_overlap: share of an observation that must face the projected line.
         max_speed_difference_px_per_ms: observed against predicted normal speed.
-        max_shared_fraction: of two lines that share more observations, the weaker one goes.
+        max_shared_fraction: of two lines that share more observations, the weaker one goes; 1
+            keeps both.
         one_side: a line keeps to observations that see its bright side where most of them do
             (`reassociate`).
     """
@@ -251,7 +252,7 @@ class MatchGlobalConfig(Stage, table="match_global"):
     max_distances_px: tuple[float, ...] = parameter((1.5, 1.1, 1.1), SOME_POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
-    max_shared_fraction: float = parameter(0.97, SHARE)
+    max_shared_fraction: float = parameter(1.0, SHARE)
     one_side: bool = True
 
     @property
