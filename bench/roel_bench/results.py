@@ -154,23 +154,37 @@ def config_digest(config: Config) -> str:
         del tables[table]
     if config.curves.method == "none":
         del tables["curves"]
+    _drop_unread_tests(config, tables)
+    if config.match_global.method != "reassociate":
+        del tables["match_global"]["max_shared_fraction"]
     if config.match_global.method != "reassociate" or not config.match_global.one_side:
         del tables["match_global"]["one_side"]
     if config.trim.method != "coverage":
         del tables["trim"]["max_foreshortening"]
-    is_on = {"pose_": config.refine.free_poses, "corner_": config.refine.corner_sigma_m > 0}
-    off = tuple(prefix for prefix in is_on if not is_on[prefix])
     if config.trim.max_error_m == UNLIMITED:
         del tables["trim"]["max_error_m"]
+    is_on = {"pose_": config.refine.free_poses, "corner_": config.refine.corner_sigma_m > 0}
+    off = tuple(prefix for prefix in is_on if not is_on[prefix])
     refine = tables["refine"]
     tables["refine"] = {key: refine[key] for key in refine if not key.startswith(off)}
+    for table in ("refine_rounds", "refine"):
+        if tables[table]["loss_scale_medians"] == 0:
+            del tables[table]["loss_scale_medians"]
     return digest_of(json.dumps(tables, sort_keys=True))
 
 
 def front_end_digest(config: Config) -> str:
     """Twelve hexadecimal digits that change with any parameter of the lines of single frames."""
     tables = to_tables(config)
+    _drop_unread_tests(config, tables)
     return digest_of(json.dumps({name: tables[name] for name in FRONT_END_TABLES}, sort_keys=True))
+
+
+def _drop_unread_tests(config: Config, tables: dict[str, Any]) -> None:
+    """Leave out the tests of lines that the plane fit of this method does not make."""
+    if config.plane_fit.method != "vote":
+        for test in ("min_occupancy", "min_density_ratio"):
+            del tables["plane_fit"][test]
 
 
 def digest_of(text: str) -> str:

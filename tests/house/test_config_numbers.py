@@ -36,7 +36,7 @@ def test_a_new_field_gets_the_next_number_wherever_it_stands(generator, numbers)
 
 
 def test_a_field_that_is_gone_is_reserved(generator, numbers):
-    numbers["TrimConfig"]["old_gap_m"] = 99
+    numbers["DetectConfig"]["old_gap_m"] = 99
     text = generator.config_proto(generator.grown_numbers(numbers))
     assert '  reserved 99;\n  reserved "old_gap_m";\n' in text
     assert "old_gap_m =" not in text
