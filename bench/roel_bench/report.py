@@ -150,7 +150,7 @@ def _acceptance(report: _Report) -> str:
         f" passes does so in both.\n\nMet: {len(by_mark[PASS])}. {_listed('Not met', by_mark[FAIL])}"
         f" {_listed('Not run', by_mark[NOT_RUN])}\n\nWhere true edges are lost, how large the IoU"
         " can be, and why three times LIMAP's cannot be had: [corners](decisions/corners.md). Which"
-        " parts stay that do not raise the IoU: [parts that guard](decisions/parts-that-guard.md)."
+        " parts are off: [those that raise no IoU](decisions/parts-that-raise-no-iou.md)."
         " What noisy poses leave: [noisy poses](decisions/noisy-poses.md). What of `events_room01`"
         " can be covered: [photographed room](decisions/photographed-room.md)."
     )
@@ -259,7 +259,7 @@ def _ablation(report: _Report) -> str:
     text = (
         "One part of the default switched off at a time, mean over rooms. The last column is what the"
         " part is worth: the share of the IoU at 20 mm that is lost without it. How parts were chosen,"
-        " on tuning rooms: [parts that do not raise the IoU](decisions/parts-that-guard.md)."
+        " on tuning rooms: [parts that raise no IoU](decisions/parts-that-raise-no-iou.md)."
     )
     return _section(
         "What each part is worth", text, _beside_default(report, variants.DEFAULT_ABLATION)
