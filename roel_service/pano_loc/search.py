@@ -201,24 +201,21 @@ def _moved(
     """Each at the best place of a finer grid around it, as one of the two scores says."""
     axis = step_m * np.array([-1.0, 0.0, 1.0])
     around = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3) @ prepared.frame
-    places, scores = seeds.places.copy(), seeds.score.copy()
+    panes = {
+        rotation: pane_of(strokes[rotation], step_m, FINE_BEARING_COUNT)
+        for rotation in np.unique(seeds.rotation)
+    }
 
-    def move(rotation: int) -> None:
-        """Those of one orientation, in place."""
-        pane = pane_of(strokes[rotation], step_m, FINE_BEARING_COUNT)
-        for member in np.flatnonzero(seeds.rotation == rotation):
-            best, scores[member] = best_place(
-                prepared.lines,
-                places[member] + around,
-                FINE_LINE_COUNT,
-                claim_bearing_count,
-                pane,
-                kind,
-            )
-            places[member] += around[best]
+    def moved(member: int) -> tuple[FloatArray, float]:
+        places = seeds.places[member] + around
+        pane = panes[seeds.rotation[member]]
+        best, score = best_place(
+            prepared.lines, places, FINE_LINE_COUNT, claim_bearing_count, pane, kind
+        )
+        return places[best], score
 
-    side_by_side(move, np.unique(seeds.rotation))
-    return _Seeds(rotation=seeds.rotation, places=places, score=scores)
+    places, scores = zip(*side_by_side(moved, range(len(seeds.score))), strict=True)
+    return _Seeds(rotation=seeds.rotation, places=np.stack(places), score=np.array(scores))
 
 
 def _ball(radius_m: float, step_m: float) -> FloatArray:
