@@ -41,7 +41,7 @@ FINE_M, FINE_DEG = 0.1, 5.0
 COARSE_M, COARSE_DEG = 0.3, 15.0
 PRIOR_TURN_RAD, PRIOR_SHIFT_M = np.radians(25.0), 0.4
 MOTION_COUNT = 4
-FEW, SOME = 3, 8
+FEW, SOME, MANY = 3, 8, 10
 
 HERE, MOVED, ELSEWHERE, PRIOR = "here", "moved", "elsewhere", "prior"
 WIDTHS_PX = (512, 1024, 4096)
@@ -168,7 +168,7 @@ PROTOCOLS = (
     Protocol(
         name=MOVED,
         kinds=(ROOM, HOUSE, HOUSE_ROOM),
-        max_count=SOME,
+        max_count=MANY,
         motions=tuple(
             anywhere(np.random.default_rng(seed), upright=False) for seed in range(MOTION_COUNT)
         ),
