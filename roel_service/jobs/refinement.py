@@ -33,6 +33,7 @@ def refine_poses(
     *,
     line_map: LineMap | None = None,
     estimate_time_offset: bool = False,
+    estimate_intrinsics: bool = False,
     progress: ProgressCallback = ignore,
 ) -> tuple[Trajectory, dict[str, Any]]:
     """Refined poses, and how that went with the keys that `roel refine-poses` prints.
@@ -49,6 +50,7 @@ def refine_poses(
         config,
         line_map=line_map,
         estimate_time_offset=estimate_time_offset,
+        estimate_intrinsics=estimate_intrinsics,
         progress=progress,
     )
     return found.trajectory, _report(found, trajectory, time.perf_counter() - started_s)
@@ -87,7 +89,7 @@ def _report(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, A
     before, after = given.T_world_camera, found.trajectory.T_world_camera
     shift_m = np.linalg.norm(after.translation - before.translation, axis=1)
     turn_rad = rotation_angle(np.swapaxes(before.rotation, -1, -2) @ after.rotation)
-    sigma_us = found.report.time_offset_sigma_us
+    sigma_us, focal = found.report.time_offset_sigma_us, found.report.focal
     return {
         "pose_count": len(found.trajectory),
         "line_count": found.report.line_count,
@@ -99,6 +101,11 @@ def _report(found: PoseResult, given: Trajectory, seconds: float) -> dict[str, A
         "mean_turn_deg": float(np.degrees(turn_rad).mean()),
         "time_offset_us": found.report.time_offset_us,
         "time_offset_sigma_us": sigma_us if np.isfinite(sigma_us) else None,
+        "focal_scale": None if focal is None else focal.scale,
+        "focal_scale_sigma": focal.sigma
+        if focal is not None and np.isfinite(focal.sigma)
+        else None,
+        "focal_is_applied": focal is not None and focal.is_applied,
         "problems": [problem.value for problem in found.report.problems],
         "seconds": seconds,
     }

@@ -68,6 +68,8 @@ class JointlyRefined:
         information: (6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2.
         costs: of the observations after each step, the first one before any; in units of their
             noise.
+        robust_cost: of the observations by their loss and of the correction by the drift, at the end;
+            what can be compared between runs.
         converged: the last step changed next to nothing.
     """
 
@@ -77,6 +79,7 @@ class JointlyRefined:
     drift_told: Drift
     information: FloatArray
     costs: list[float]
+    robust_cost: float
     converged: bool
 
 
@@ -185,6 +188,7 @@ def refine_jointly(
         drift_told=state.drift_told,
         information=problem.reduced(system, 0.0).hessian,
         costs=[*costs, system.observation_cost],
+        robust_cost=problem.robust_cost(state),
         converged=converged,
     )
 
@@ -282,6 +286,22 @@ class _Problem:
 
     def weight(self, state: _State, *, loose: bool) -> FloatArray:
         """(S,) weights of iterated reweighting, 0 for outliers."""
+        residual_px = self.residuals_px(state)
+        gate_px = self.config.max_residual_px * (FIRST_GATE if loose else 1.0)
+        robust = 1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2)
+        return np.asarray(
+            np.where(residual_px < gate_px, robust, 0.0) * self.length_weight * self.precision
+        )
+
+    def robust_cost(self, state: _State) -> float:
+        """Of the observations by the loss that `weight` is of, none more than at the gate; and drift."""
+        config = self.config
+        residual_px = np.minimum(self.residuals_px(state), config.max_residual_px)
+        loss_px2 = config.loss_scale_px**2 * np.log1p((residual_px / config.loss_scale_px) ** 2)
+        return float(self.precision * self.length_weight @ loss_px2) + self.drift_cost(state)
+
+    def residuals_px(self, state: _State) -> FloatArray:
+        """(S,) distances of the observations' ends from their lines."""
         v, m = state.lines.plucker
         poses = self.moved_poses(state)
 
@@ -299,12 +319,7 @@ class _Problem:
                 self.frames.focal_px,
             )
 
-        residual_px = np.concatenate(self._of_parts(residuals_of))
-        gate_px = self.config.max_residual_px * (FIRST_GATE if loose else 1.0)
-        robust = 1.0 / (1.0 + (residual_px / self.config.loss_scale_px) ** 2)
-        return np.asarray(
-            np.where(residual_px < gate_px, robust, 0.0) * self.length_weight * self.precision
-        )
+        return np.concatenate(self._of_parts(residuals_of))
 
     def line_costs(self, lines: OrthonormalLines, poses: SE3, weight: FloatArray) -> FloatArray:
         """(L,) of observations and directions, with fixed (S,) weights."""

@@ -7,6 +7,7 @@ poses that are too poor for the right matches get better ones.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass, replace
 from typing import TypeVar
@@ -23,6 +24,7 @@ from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.first_lines import check_line_count
+from roel_service.mapping.focal_search import MAX_COST_COUNT, estimate_focal, with_focal
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected, lines_of_all_frames, worker_count
 from roel_service.mapping.joint import JointlyRefined, refine_jointly
@@ -41,7 +43,13 @@ from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.lines import InfiniteLines, LineMap
-from roel_service.scene.results import MAPPING_STAGES, PoseProblem, PoseReport, PoseResult
+from roel_service.scene.results import (
+    MAPPING_STAGES,
+    FocalEstimate,
+    PoseProblem,
+    PoseReport,
+    PoseResult,
+)
 from roel_service.scene.trajectory import Trajectory
 
 logger = logging.getLogger(__name__)
@@ -56,6 +64,8 @@ FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
 LEAST_OFFSET_US, OFFSET_SIGMA_COUNT = 4_000.0, 4.0
 MAX_OFFSET_COUNT = 3
+# Of the time, if a focal length is looked for.
+FOCAL_SHARE = 0.8
 # A drift that is learned to be so many times larger than expected is none of an odometry.
 FAR_FACTOR = 3.0
 PROBLEMS = {
@@ -104,6 +114,7 @@ def refine_poses(
     *,
     line_map: LineMap | None = None,
     estimate_time_offset: bool = False,
+    estimate_intrinsics: bool = False,
     progress: ProgressCallback = ignore,
 ) -> PoseResult:
     """Refine the poses of a recording, together with the lines that it sees or in a given map.
@@ -112,7 +123,8 @@ def refine_poses(
     as large as they are.
 
     Args:
-        events: read front to back, again for every estimate of the time offset.
+        events: read front to back, again for every estimate of the time offset, and for every focal
+            length that is tried.
         trajectory: poses on the clock of the events.
         camera: calibration of the sensor.
         config: parameters of every stage; those of the poses are in `refine`.
@@ -121,6 +133,8 @@ def refine_poses(
         estimate_time_offset: whether the clock of the poses may run beside that of the events; the
             result is on the latter, at the times that were given. The published batch
             (`refine.pose_method`) does not tell.
+        estimate_intrinsics: whether the focal length may be off. It is looked for with the given
+            clock, by some six refinements; the same holds for the published batch.
         progress: called often; may raise `Cancelled`.
 
     Raises:
@@ -133,6 +147,13 @@ def refine_poses(
     if config.refine.pose_method == "batch" and line_map is None:
         return refine_poses_at_once(events, trajectory, camera, config, progress)
     seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
+    focal = None
+    if estimate_intrinsics:
+        searching, progress = (
+            part_of(progress, *share) for share in ((0.0, FOCAL_SHARE), (FOCAL_SHARE, 1.0))
+        )
+        focal = _focal(events, trajectory, camera, config, line_map, seconds, searching)
+        camera = with_focal(camera, focal.scale) if focal.is_applied else camera
     applied_us = 0
     count = MAX_OFFSET_COUNT if estimate_time_offset else 1
     for index in range(count):
@@ -145,7 +166,7 @@ def refine_poses(
         if index + 1 == count or not left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT):
             break
         applied_us += round(left.offset_us)
-    report = _report(found, left, trajectory, config, applied_us, seconds)
+    report = replace(_report(found, left, trajectory, config, applied_us, seconds), focal=focal)
     for problem in report.problems:
         logger.warning("poses: %s", PROBLEMS[problem])
     poses, covariance = laid_over(
@@ -169,6 +190,29 @@ def in_likeliest_world(refined: Trajectory, given: Trajectory, config: RefineCon
     poses, asked = refined.T_world_camera, given.T_world_camera
     T_world_refined = align_poses(poses, asked, lever_m=drift.sigma_m / drift.sigma_rad)
     return Trajectory(t_us=refined.t_us, T_world_camera=T_world_refined @ poses)
+
+
+def _focal(
+    events: EventSource,
+    trajectory: Trajectory,
+    camera: Camera,
+    config: Config,
+    line_map: LineMap | None,
+    seconds: dict[str, float],
+    progress: ProgressCallback,
+) -> FocalEstimate:
+    """The focal length with which a recording is refined best."""
+    tried = itertools.count()
+
+    def cost(scale: float) -> float:
+        index = next(tried)
+        share = part_of(progress, index / MAX_COST_COUNT, (index + 1) / MAX_COST_COUNT)
+        run = MappingRun(share, seconds=seconds)
+        other = with_focal(camera, scale)
+        found = _found(events, trajectory, other, config, line_map, run)
+        return sum(window.last.robust_cost for window in found)
+
+    return estimate_focal(cost)
 
 
 def _found(

@@ -154,6 +154,21 @@ class PoseProblem(Enum):
     FAR_OFF = "FAR_OFF"  # they, or the calibration, are off by far more than an odometry's
 
 
+@dataclass(frozen=True, kw_only=True)
+class FocalEstimate:
+    """How far off a given focal length is.
+
+    Attributes:
+        scale: what it has to be multiplied by.
+        sigma: standard deviation of `scale`; infinite where nothing tells.
+        is_applied: the results are of the estimated focal length, not of the given one.
+    """
+
+    scale: float
+    sigma: float
+    is_applied: bool
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PoseReport:
     """How poses were refined.
@@ -167,6 +182,7 @@ class PoseReport:
             first and after the last step.
         time_offset_us, time_offset_sigma_us: what has to be added to the times of the given poses,
             and its standard deviation; infinite where nothing tells.
+        focal: how far off the given focal length is; none where that was not asked for.
         problems: what a caller should look at before the poses are used.
         seconds: wall-clock time of each stage.
     """
@@ -179,6 +195,7 @@ class PoseReport:
     cost_final: float
     time_offset_us: float
     time_offset_sigma_us: float
+    focal: FocalEstimate | None = None
     problems: tuple[PoseProblem, ...]
     seconds: dict[str, float]
 

@@ -26,8 +26,9 @@ from roel_service.tracking.whereabouts import Whereabouts
 
 # To be found, a pose needs events this far around it; to be followed, those of its interval do.
 FINDING_HALF_US = 25_000
-# A lost pose is looked for in so many intervals at once, and in every so many after that.
-FINDING_AT_ONCE, FINDING_STRIDE = 2, 10
+# A lost pose is looked for in so many intervals at once, then, for a while, in every so many, and in
+# every so many after that.
+FINDING_AT_ONCE, EARLY_COUNT, EARLY_STRIDE, FINDING_STRIDE = 2, 16, 4, 10
 # Its turn is looked at in every so many.
 GLIMPSE_STRIDE = 2
 # Without events for so long, the camera may be anywhere within reach.
@@ -191,7 +192,8 @@ class PoseTracker:
 
     def _is_searched(self, attempt: int) -> bool:
         """Whether a lost camera is looked for in this window, which takes as long as many others."""
-        return attempt < FINDING_AT_ONCE or attempt % FINDING_STRIDE == 0
+        stride = EARLY_STRIDE if attempt < EARLY_COUNT else FINDING_STRIDE
+        return attempt < FINDING_AT_ONCE or attempt % stride == 0
 
     def _lose(self) -> None:
         self._followers = []

@@ -33,6 +33,9 @@ KEYS = [
     "mean_turn_deg",
     "time_offset_us",
     "time_offset_sigma_us",
+    "focal_scale",
+    "focal_scale_sigma",
+    "focal_is_applied",
     "problems",
     "seconds",
 ]
@@ -104,11 +107,12 @@ def test_poses_to_write_need_poses_to_refine(folder: Path) -> None:
     assert not (folder / "none.txt").exists()
 
 
-def test_a_server_does_not_estimate_time_offsets(folder: Path) -> None:
-    given = ("--out", "none.txt", "--estimate-time-offset", "--server", "localhost:1")
+@pytest.mark.parametrize("option", ["--estimate-time-offset", "--estimate-intrinsics"])
+def test_a_server_estimates_neither_clocks_nor_cameras(folder: Path, option: str) -> None:
+    given = ("--out", "none.txt", option, "--server", "localhost:1")
     done = roel(folder, "refine-poses", *INPUTS, *given)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("roel: error: --estimate-time-offset: expected no --server")
+    assert done.stderr.startswith(f"roel: error: {option}: expected no --server")
 
 
 def test_poses_without_lines_have_no_answer(folder: Path) -> None:

@@ -8,6 +8,7 @@ from roel_service.errors import Cancelled, NoAnswerError
 from roel_service.evaluation.poses import trajectory_errors, translation_errors_m
 from roel_service.geometry.alignment import align_points
 from roel_service.mapping import pose_windows
+from roel_service.mapping.focal_search import with_focal
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import gates_px, in_likeliest_world, refine_poses
 from roel_service.scene.lines import LineMap
@@ -117,6 +118,16 @@ class TestAClockThatIsOff:
             moved = found.trajectory.T_world_camera[inside]
             true = truth.interpolate(np.minimum(late.t_us, truth.t_us[-1]))[inside]
             assert translation_errors_m(moved, true).mean() < 0.05
+
+
+@pytest.mark.slow
+def test_a_focal_length_that_is_too_long_is_found():
+    longer = with_focal(CAMERA, 1.03)
+    found = refine_poses(event_stream(), trajectory(), longer, CONFIG, estimate_intrinsics=True)
+    focal = found.report.focal
+    assert focal.is_applied
+    assert abs(1.03 * focal.scale - 1.0) < 3.0 * focal.sigma
+    assert trajectory_errors(found.trajectory, trajectory()).ate_rmse_m < 0.005
 
 
 def test_poses_that_jump_are_told(noisy):

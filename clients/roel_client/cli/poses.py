@@ -36,6 +36,11 @@ def add_commands(subparsers: Subparsers) -> None:
         help="the clock of the poses may run beside that of the events; OUT is on the latter",
     )
     parser.add_argument(
+        "--estimate-intrinsics",
+        action="store_true",
+        help="the focal length may be off, by up to 4 %%; some six times as long",
+    )
+    parser.add_argument(
         "--plot",
         type=suffixed(".png"),
         metavar="FILE.png",
@@ -52,8 +57,9 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Refine the poses of a recording, and write them at their own times."""
     from roel_client.local import poses, recordings
 
-    if options.estimate_time_offset and options.server is not None:
-        raise UsageError("--estimate-time-offset", "no --server beside it", options.server)
+    for name in ("--estimate-time-offset", "--estimate-intrinsics"):
+        if getattr(options, name[2:].replace("-", "_")) and options.server is not None:
+            raise UsageError(name, "no --server beside it", options.server)
     config = effective_config(options, seed_table(options))
     recording = recordings.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
@@ -66,6 +72,7 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
                 config,
                 staged["out"],
                 estimate_time_offset=options.estimate_time_offset,
+                estimate_intrinsics=options.estimate_intrinsics,
                 progress=progress,
             )
         else:
@@ -86,9 +93,12 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
 
 
 def _told(result: dict[str, Any], out: str) -> str:
+    focal = ""
+    if result["focal_is_applied"]:
+        focal = f"; focal length times {result['focal_scale']:.4f}"
     problems = "".join(f"; {problem}" for problem in result["problems"])
     return (
         f"{out}: {result['pose_count']} poses moved by {1e3 * result['mean_shift_m']:.1f} mm and "
         f"{result['mean_turn_deg']:.2f} degrees in the mean, held by {result['line_count']} lines; "
-        f"{result['seconds']:.1f} s{problems}"
+        f"{result['seconds']:.1f} s{focal}{problems}"
     )

@@ -24,6 +24,7 @@ def refine_poses(
     out: Path,
     *,
     estimate_time_offset: bool,
+    estimate_intrinsics: bool,
     progress: ProgressCallback,
 ) -> tuple[dict[str, Any], Trajectory]:
     """Refine the poses of a recording, with its own lines or in a map, and write them.
@@ -47,6 +48,7 @@ def refine_poses(
             config,
             line_map=line_map,
             estimate_time_offset=estimate_time_offset,
+            estimate_intrinsics=estimate_intrinsics,
             progress=progress,
         )
     write_poses(trajectory, out)
@@ -95,6 +97,9 @@ def refine_poses_remotely(
         "mean_turn_deg": answer.mean_turn_deg,
         "time_offset_us": answer.time_offset_us,
         "time_offset_sigma_us": answer.time_offset_sigma_us if has_sigma else None,
+        "focal_scale": None,
+        "focal_scale_sigma": None,
+        "focal_is_applied": False,
         "problems": list(answer.problems),
         "seconds": time.perf_counter() - started_s,
     }
