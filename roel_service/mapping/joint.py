@@ -56,6 +56,23 @@ PART_COUNT = 4
 MAX_ELEMENT_COUNT = 2**23
 
 
+@dataclass(frozen=True, kw_only=True)
+class FocalError:
+    """By how much the true focal length is larger than the given one, as a share of it.
+
+    Attributes:
+        share: the estimate, linearised.
+        sigma: its standard deviation; infinite where nothing tells.
+    """
+
+    share: float
+    sigma: float
+
+    def exceeds(self, least: float, sigma_count: float) -> bool:
+        """Whether it is large, and surely so."""
+        return abs(self.share) > max(least, sigma_count * self.sigma)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JointlyRefined:
     """Lines and the correction of the poses that they were refined with.
@@ -71,6 +88,7 @@ class JointlyRefined:
         robust_cost: of the observations by their loss and of the correction by the drift, at the end;
             what can be compared between runs.
         converged: the last step changed next to nothing.
+        focal_error: what poses, lines and observations say of the calibration.
     """
 
     lines: InfiniteLines
@@ -81,6 +99,7 @@ class JointlyRefined:
     costs: list[float]
     robust_cost: float
     converged: bool
+    focal_error: FocalError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -180,7 +199,8 @@ def refine_jointly(
         converged = system.cost - cost <= CONVERGED_SHARE * system.cost
         if converged and iteration >= LOOSE_ITERATION_COUNT:
             break
-    system = problem.system(state, problem.weight(state, loose=False))
+    weight = problem.weight(state, loose=False)
+    system = problem.system(state, weight)
     return JointlyRefined(
         lines=problem.world_lines(state),
         correction=state.correction,
@@ -190,6 +210,7 @@ def refine_jointly(
         costs=[*costs, system.observation_cost],
         robust_cost=problem.robust_cost(state),
         converged=converged,
+        focal_error=problem.focal_error(state, system, weight),
     )
 
 
@@ -375,29 +396,10 @@ class _Problem:
 
     def _by_tangents(self, state: _State, weight: FloatArray) -> tuple[FloatArray, ...]:
         """What `joint_system` finds, by the tangents of the poses."""
-        v, m = state.lines.plucker
-        jacobian = np.concatenate(
-            plucker.plucker_jacobians(state.lines.U, state.lines.phi), axis=-2
-        )
-        poses = self.moved_poses(state)
-        tangent = self.shares @ state.correction.control
-        by_tangent = rotation_vector_jacobian(tangent[:, :3])
+        seen = self._linearised(state)
 
         def system_of(part: _Part) -> tuple[FloatArray, ...]:
-            return joint_kernels.joint_system(
-                part.offsets,
-                self.origin[part.lines],
-                v[part.lines],
-                m[part.lines],
-                jacobian[part.lines],
-                poses.rotation,
-                poses.translation,
-                by_tangent,
-                self.frame_of,
-                self.observation[part.rows],
-                self.forms,
-                weight[part.rows],
-            )
+            return joint_kernels.joint_system(*seen(part), weight[part.rows])
 
         cost, by_line, by_lines, by_pose, by_poses, rows = zip(
             *self._of_parts(system_of), strict=True
@@ -410,6 +412,33 @@ class _Problem:
             np.sum(by_poses, axis=0),
             np.concatenate(rows),
         )
+
+    def _linearised(self, state: _State) -> Callable[[_Part], tuple[FloatArray, ...]]:
+        """The arguments of `joint_system` for a part of the lines, but for the weights."""
+        v, m = state.lines.plucker
+        jacobian = np.concatenate(
+            plucker.plucker_jacobians(state.lines.U, state.lines.phi), axis=-2
+        )
+        poses = self.moved_poses(state)
+        tangent = self.shares @ state.correction.control
+        by_tangent = rotation_vector_jacobian(tangent[:, :3])
+
+        def arguments(part: _Part) -> tuple[FloatArray, ...]:
+            return (
+                part.offsets,
+                self.origin[part.lines],
+                v[part.lines],
+                m[part.lines],
+                jacobian[part.lines],
+                poses.rotation,
+                poses.translation,
+                by_tangent,
+                self.frame_of,
+                self.observation[part.rows],
+                self.forms,
+            )
+
+        return arguments
 
     def reduced(self, system: _System, damping: float) -> _Reduced:
         """The system of the control points alone."""
@@ -451,6 +480,30 @@ class _Problem:
 
         taken, pull = (sum(of_parts) for of_parts in zip(*self._of_parts(taken_by), strict=True))
         return np.asarray(np.triu(taken) + np.triu(taken, 1).T), np.asarray(pull)
+
+    def focal_error(self, state: _State, system: _System, weight: FloatArray) -> FocalError:
+        """One step of the focal length together with everything else, and how sure it is.
+
+        Args:
+            system: normal equations of this state, with these (S,) weights.
+        """
+        gradient, hessian, by_line, by_pose = joint_kernels.focal_system(
+            *self._linearised(state)(_parts(self.offsets, 1)[0]), weight
+        )
+        by_control = (self.shares.T @ by_pose).ravel()
+        reduced = self.reduced(system, 0.0)
+        if self.free_lines:
+            solved = np.einsum("lij,lj->li", reduced.line_inverse, by_line)
+            gradient -= float(np.sum(solved * system.line_gradient))
+            hessian -= float(np.sum(solved * by_line))
+            crossed = replace(system, line_gradient=by_line)
+            by_control = by_control - self._taken_by_lines(crossed, reduced.line_inverse)[1]
+        held = linalg.solve(reduced.hessian, by_control, assume_a="pos")
+        information = hessian - float(held @ by_control)
+        if information <= 0.0:
+            return FocalError(share=0.0, sigma=float("inf"))
+        share = -(gradient - float(held @ reduced.gradient)) / information
+        return FocalError(share=share, sigma=information**-0.5)
 
     def _of_parts(self, function: Callable[[_Part], Result]) -> list[Result]:
         """What a function makes of each part of the lines; in threads, always the same parts."""

@@ -59,6 +59,33 @@ def multiplied(A: Array, D: Array) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def row_jacobian(
+    R: Array,
+    centre: tuple[float, float, float],
+    v: Array,
+    m: Array,
+    jacobian: Array,
+    by_tangent: Array,
+    J: Array,
+) -> None:
+    """Write how the line's (4) and the tangent's (6) parameters move (v_c, m_c) to `J` (6, 10)."""
+    cx, cy, cz = centre
+    column, seen = np.empty(6), np.empty(3)
+    for p in range(4):
+        into_camera(R, cx, cy, cz, jacobian[:3, p], jacobian[3:, p], column)
+        J[:, p] = column
+    seen[0] = m[0] - (cy * v[2] - cz * v[1])
+    seen[1] = m[1] - (cz * v[0] - cx * v[2])
+    seen[2] = m[2] - (cx * v[1] - cy * v[0])
+    turned_cross(R, v, J[:3, 4:7])
+    turned_cross(R, seen, J[3:, 4:7])
+    J[:3, 7:] = 0.0
+    J[3:, 7:] = J[:3, 4:7]
+    multiplied(J[:3, 4:7], by_tangent)
+    multiplied(J[3:, 4:7], by_tangent)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def end_residuals(
     offsets: Array,
     origin: Array,
@@ -161,7 +188,7 @@ def joint_system(
     by_pose = np.zeros((frame_count, 6))
     by_poses = np.zeros((frame_count, 6, 6))
     by_both = np.zeros((len(observation), 4, 6))
-    y, column, seen = np.empty(6), np.empty(6), np.empty(3)
+    y = np.empty(6)
     J, GJ = np.zeros((6, 10)), np.empty((6, 10))
     slope, block = np.empty(10), np.empty((10, 10))
     for line in range(line_count):
@@ -171,18 +198,8 @@ def joint_system(
             k = observation[row]
             f = frame[k]
             R = rotation[f]
-            cx, cy, cz = seen_line(R, position[f], origin[line], v[line], m[line], y)
-            for p in range(4):
-                into_camera(R, cx, cy, cz, jacobian[line, :3, p], jacobian[line, 3:, p], column)
-                J[:, p] = column
-            seen[0] = m[line, 0] - (cy * v[line, 2] - cz * v[line, 1])
-            seen[1] = m[line, 1] - (cz * v[line, 0] - cx * v[line, 2])
-            seen[2] = m[line, 2] - (cx * v[line, 1] - cy * v[line, 0])
-            turned_cross(R, v[line], J[:3, 4:7])
-            turned_cross(R, seen, J[3:, 4:7])
-            J[3:, 7:] = J[:3, 4:7]
-            multiplied(J[:3, 4:7], by_tangent[f])
-            multiplied(J[3:, 4:7], by_tangent[f])
+            centre = seen_line(R, position[f], origin[line], v[line], m[line], y)
+            row_jacobian(R, centre, v[line], m[line], jacobian[line], by_tangent[f], J)
             for i in range(6):
                 for p in range(10):
                     value = 0.0
@@ -211,6 +228,55 @@ def joint_system(
             by_poses[f] += block[4:, 4:]
             by_both[row] = block[:4, 4:]
     return cost, by_line, by_lines, by_pose, by_poses, by_both
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def focal_system(
+    offsets: Array,
+    origin: Array,
+    v: Array,
+    m: Array,
+    jacobian: Array,
+    rotation: Array,
+    position: Array,
+    by_tangent: Array,
+    frame: Array,
+    observation: Array,
+    forms: Array,
+    weight: Array,
+) -> tuple[float, float, Array, Array]:
+    """What the focal length adds to the normal equations; arguments as in `joint_system`.
+
+    A ray (x/f, y/f, 1) meets the moment (a, b, c) as (x, y, 1) meets (a/f, b/f, c): where f grows
+    by a share, a and b shrink by it.
+
+    Returns:
+        Gradient and Hessian by the share; Hessians by it and lines (L, 4), tangents (N, 6).
+    """
+    gradient, hessian = 0.0, 0.0
+    by_line, by_pose = np.zeros((len(v), 4)), np.zeros((len(rotation), 6))
+    y, J, pull = np.empty(6), np.zeros((6, 10)), np.empty(6)
+    for line in range(len(v)):
+        for row in range(offsets[line], offsets[line + 1]):
+            if weight[row] == 0.0:
+                continue
+            k = observation[row]
+            f = frame[k]
+            centre = seen_line(rotation[f], position[f], origin[line], v[line], m[line], y)
+            row_jacobian(rotation[f], centre, v[line], m[line], jacobian[line], by_tangent[f], J)
+            ratio, squared = quotient(forms[k], y)
+            scale = weight[row] / squared
+            for i in range(6):
+                pull[i] = -scale * (forms[k, i, 3] * y[3] + forms[k, i, 4] * y[4])
+                gradient += y[i] * pull[i]
+            gradient += scale * ratio * (y[3] * y[3] + y[4] * y[4])
+            hessian -= pull[3] * y[3] + pull[4] * y[4]
+            for i in range(6):
+                for p in range(4):
+                    by_line[line, p] += J[i, p] * pull[i]
+                for p in range(6):
+                    by_pose[f, p] += J[i, 4 + p] * pull[i]
+    return gradient, hessian, by_line, by_pose
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

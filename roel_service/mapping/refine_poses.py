@@ -66,6 +66,8 @@ LEAST_OFFSET_US, OFFSET_SIGMA_COUNT = 4_000.0, 4.0
 MAX_OFFSET_COUNT = 3
 # Of the time, if a focal length is looked for.
 FOCAL_SHARE = 0.8
+# A focal length that is off by a smaller share is not told: noisy poses alone may feign .7 %.
+LEAST_FOCAL_SHARE = 0.015
 # A drift that is learned to be so many times larger than expected is none of an odometry.
 FAR_FACTOR = 3.0
 PROBLEMS = {
@@ -311,13 +313,29 @@ def _problems(
     is_there = {
         PoseProblem.JUMPS: bool(pose_jumps(trajectory).any()),
         PoseProblem.TIME_OFFSET: left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT),
-        PoseProblem.FAR_OFF: any(
+        PoseProblem.FAR_OFF: _focal_length_is_off(found)
+        or any(
             drift.sigma_rad > FAR_FACTOR * expected.sigma_rad
             or drift.sigma_m > FAR_FACTOR * expected.sigma_m
             for drift in drifts
         ),
     }
     return tuple(problem for problem, there in is_there.items() if there)
+
+
+def _focal_length_is_off(found: list[_Found]) -> bool:
+    """Whether the lines of any window say so; then by how much is told."""
+    off = [
+        error
+        for error in (window.last.focal_error for window in found)
+        if error.exceeds(LEAST_FOCAL_SHARE, OFFSET_SIGMA_COUNT)
+    ]
+    for error in off:
+        logger.warning(
+            "calibration: the focal length seems to be %+.1f %% off what is given",
+            100.0 * error.share,
+        )
+    return bool(off)
 
 
 def gates_px(config: RefineConfig, focal_px: float) -> list[float]:

@@ -12,6 +12,7 @@ from roel_service.mapping.front_end import Detected
 from roel_service.mapping.joint import _believed, _Problem, _State, refine_jointly
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import DirectionPrior, OrthonormalLines, refine_lines
+from roel_service.mapping.views import views_of
 
 from .synthetic import line_errors, observed, perturbed, trajectory, world
 
@@ -137,6 +138,31 @@ class TestRecovery:
         found = refine_jointly(lines_of(exact, detected), none, DRIFT, detected, still, None)
         assert not found.correction.control.any()
         assert not found.converged
+
+
+class TestFocalLength:
+    @pytest.mark.parametrize("free_lines", [True, False])
+    def test_what_it_lacks_is_told(self, free_lines):
+        exact = world()
+        K = exact.frames.K.copy()
+        # A camera whose focal length is given 2 % too small.
+        K[:2, :2] /= 1.02
+        detected = seen(exact)
+        frames = dataclasses.replace(detected.frames, K=K)
+        scale = np.array([1.0, 1.0, 1.0, 1.02, 1.02, 1.0])
+        evidence = dataclasses.replace(
+            detected.evidence,
+            views=views_of(exact.observations, frames),
+            event_forms=scale[:, None] * detected.evidence.event_forms * scale,
+            segment_forms=scale[:, None] * detected.evidence.segment_forms * scale,
+        )
+        wrong = dataclasses.replace(detected, frames=frames, evidence=evidence)
+        none = PoseCorrection.none(trajectory(), INTERVAL_US)
+        for case, share in ((detected, 0.0), (wrong, 0.02)):
+            start = lines_of(exact, case)
+            found = refine_jointly(start, none, DRIFT, case, CONFIG, None, free_lines=free_lines)
+            assert found.focal_error.share == pytest.approx(share, abs=0.005)
+            assert found.focal_error.exceeds(0.01, 4.0) == (share > 0.0)
 
 
 class TestGradient:
