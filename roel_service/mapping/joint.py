@@ -18,7 +18,7 @@ from typing import TypeVar
 import numpy as np
 from scipy import linalg, sparse
 
-from roel_service.arrays import FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray, IntArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker, projection
 from roel_service.geometry.se3 import SE3, rotation_vector_jacobian
@@ -43,6 +43,8 @@ from roel_service.mapping.refine import (
 from roel_service.scene.lines import InfiniteLines
 
 Result = TypeVar("Result")
+# Those of `joint_kernels.joint_system`, but for the weights.
+SystemArguments = tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]
 
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 6
@@ -413,7 +415,7 @@ class _Problem:
             np.concatenate(rows),
         )
 
-    def _linearised(self, state: _State) -> Callable[[_Part], tuple[FloatArray, ...]]:
+    def _linearised(self, state: _State) -> Callable[[_Part], SystemArguments]:
         """The arguments of `joint_system` for a part of the lines, but for the weights."""
         v, m = state.lines.plucker
         jacobian = np.concatenate(
@@ -423,7 +425,7 @@ class _Problem:
         tangent = self.shares @ state.correction.control
         by_tangent = rotation_vector_jacobian(tangent[:, :3])
 
-        def arguments(part: _Part) -> tuple[FloatArray, ...]:
+        def arguments(part: _Part) -> SystemArguments:
             return (
                 part.offsets,
                 self.origin[part.lines],
