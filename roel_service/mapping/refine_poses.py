@@ -16,6 +16,7 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import Config, RefineConfig, RefineRoundsConfig
+from roel_service.errors import ConfigError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_poses, as_large_as
 from roel_service.geometry.se3 import SE3
@@ -133,13 +134,13 @@ def refine_poses(
         line_map: lines that stay as they are; the given poses are roughly those in its world. What
             finds poses there is the smooth correction, whichever method is configured.
         estimate_time_offset: whether the clock of the poses may run beside that of the events; the
-            result is on the latter, at the times that were given. The published batch
-            (`refine.pose_method`) does not tell.
+            result is on the latter, at the times that were given.
         estimate_intrinsics: whether the focal length may be off. It is looked for with the given
-            clock, by some six refinements; the same holds for the published batch.
+            clock, by some six refinements.
         progress: called often; may raise `Cancelled`.
 
     Raises:
+        ConfigError: the published batch (`refine.pose_method`) is to estimate more than poses.
         EventsError: no events.
         TrajectoryError: poses that cover less than a tenth of the recording.
         LimitError: RECORDING_TOO_LONG, a gap in the poses that is longer than can be refined at once.
@@ -147,6 +148,9 @@ def refine_poses(
         Cancelled: as raised by `progress`.
     """
     if config.refine.pose_method == "batch" and line_map is None:
+        if estimate_time_offset or estimate_intrinsics:
+            expected = "smooth, where a time offset or intrinsics are estimated"
+            raise ConfigError("refine.pose_method", expected, "batch")
         return refine_poses_at_once(events, trajectory, camera, config, progress)
     seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
     focal = None

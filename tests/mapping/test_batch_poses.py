@@ -38,6 +38,12 @@ def test_the_published_preset_refines_in_one_batch(found):
     assert np.isinf(found.report.time_offset_sigma_us)
 
 
+@pytest.mark.parametrize("estimated", ["estimate_time_offset", "estimate_intrinsics"])
+def test_the_batch_estimates_nothing_but_poses(estimated):
+    with pytest.raises(ConfigError, match=r"refine\.pose_method: expected smooth"):
+        refine_poses(event_stream(), noisy_trajectory(), CAMERA, PAPER, **{estimated: True})
+
+
 def test_poses_are_those_of_the_given_times(found):
     given = noisy_trajectory()
     np.testing.assert_array_equal(found.trajectory.t_us, given.t_us)
