@@ -90,6 +90,7 @@ DEFAULT_ABLATION = (
     _without("rounds of re-association", match_global={"max_distances_px": [1.5]}),
     _without("speed gate", match_global={"max_speed_difference_px_per_ms": UNLIMITED}),
     _without("one side of edges", match_global={"one_side": False}),
+    _without("sharing rule", match_global={"max_shared_fraction": 1.0}),
     _without("event term", **_refined({"event_weight": 0.0})),
     _without("robust loss", **_refined({"loss": "squared"})),
     _without("shared directions", **_refined({"direction_sigma_deg": 0.0})),
@@ -103,7 +104,6 @@ DEFAULT_ABLATION = (
 OFF_BY_DEFAULT = (
     _with("density test", plane_fit={"min_density_ratio": 1.6}),
     _with("occupancy test", plane_fit={"min_occupancy": 0.6}),
-    _with("sharing rule", match_global={"max_shared_fraction": 0.97}),
     _with("overlap removal", trim={"overlap_distance_m": 0.012}),
 )
 

@@ -252,7 +252,7 @@ class MatchGlobalConfig(Stage, table="match_global"):
     max_distances_px: tuple[float, ...] = parameter((1.5, 1.1, 1.1), SOME_POSITIVE)
     min_overlap: float = parameter(0.3, SHARE)
     max_speed_difference_px_per_ms: float = parameter(0.04, POSITIVE)
-    max_shared_fraction: float = parameter(1.0, SHARE)
+    max_shared_fraction: float = parameter(0.97, SHARE)
     one_side: bool = True
 
     @property
