@@ -81,6 +81,8 @@ DEFAULT_ABLATION = (
             "inlier_distance_px": 2.0,
         },
     ),
+    _without("density test", plane_fit={"min_density_ratio": 0.0}),
+    _without("occupancy test", plane_fit={"min_occupancy": 0.0}),
     _without("prediction of matches", match_local={"predict": False}),
     _without("re-association", match_global={"method": "none"}),
     _without(
@@ -101,11 +103,7 @@ DEFAULT_ABLATION = (
 )
 
 # What is off by default, switched on.
-OFF_BY_DEFAULT = (
-    _with("density test", plane_fit={"min_density_ratio": 1.6}),
-    _with("occupancy test", plane_fit={"min_occupancy": 0.6}),
-    _with("overlap removal", trim={"overlap_distance_m": 0.012}),
-)
+OFF_BY_DEFAULT = (_with("overlap removal", trim={"overlap_distance_m": 0.012}),)
 
 # Curved edges, which the default leaves to its lines.
 CURVE_VARIANTS = tuple(

@@ -484,8 +484,12 @@ def _with_gate(config: Config, gate_px: float) -> Config:
 
 
 def _gated(costs: Costs, gate_px: float, scale_px: float) -> Costs:
+    # Residuals are those of the poses: a loss that followed them would let wrong matches in.
     return replace(
-        costs, max_residual_px=max(costs.max_residual_px, gate_px), loss_scale_px=scale_px
+        costs,
+        max_residual_px=max(costs.max_residual_px, gate_px),
+        loss_scale_px=scale_px,
+        loss_scale_medians=0.0,
     )
 
 
