@@ -150,7 +150,7 @@ def _acceptance(report: _Report) -> str:
         f" passes does so in both.\n\nMet: {len(by_mark[PASS])}. {_listed('Not met', by_mark[FAIL])}"
         f" {_listed('Not run', by_mark[NOT_RUN])}\n\nWhere true edges are lost, how large the IoU"
         " can be, and why three times LIMAP's cannot be had: [corners](decisions/corners.md). Which"
-        " parts are off: [those that raise no IoU](decisions/parts-that-raise-no-iou.md)."
+        " parts stay though they raise no IoU: [why](decisions/parts-that-raise-no-iou.md)."
         " What noisy poses leave: [noisy poses](decisions/noisy-poses.md). What of `events_room01`"
         " can be covered: [photographed room](decisions/photographed-room.md)."
     )
