@@ -41,7 +41,6 @@ PAPER = Config(
         residual="grassmann",
         loss="squared",
         loss_scale_px=0.7,
-        loss_scale_medians=0.0,
         event_weight=1e4,
         event_count_per_line=50,
         max_length_weight_px=UNLIMITED,
@@ -53,9 +52,7 @@ PAPER = Config(
         pose_iteration_count=60,
     ),
     # What triangulation takes from here; the rest of its cost is its own.
-    refine_rounds=RefineRoundsConfig(
-        loss_scale_px=0.7, loss_scale_medians=0.0, max_residual_px=20.0, min_inlier_count=10
-    ),
+    refine_rounds=RefineRoundsConfig(loss_scale_px=0.7, max_residual_px=20.0, min_inlier_count=10),
     # The paper has no such limit.
     trim=TrimConfig(method="cluster", max_error_m=UNLIMITED),
 )

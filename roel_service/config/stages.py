@@ -333,7 +333,7 @@ class RefineRoundsConfig(Stage, table="refine_rounds"):
     residual: str = parameter("pixel", one_of(REFINE_RESIDUALS))
     loss: str = parameter("cauchy", one_of(REFINE_LOSSES))
     loss_scale_px: float = parameter(0.5, POSITIVE)
-    loss_scale_medians: float = parameter(3.0, NOT_NEGATIVE)
+    loss_scale_medians: float = parameter(0.0, NOT_NEGATIVE)
     event_weight: float = parameter(1.0, NOT_NEGATIVE)
     max_length_weight_px: float = parameter(60.0, POSITIVE)
     direction_sigma_deg: float = parameter(0.5, Rule("in [0, 10]", lambda value: 0 <= value <= 10))

@@ -27,8 +27,8 @@ from roel_service.scene.results import TrackStatus
 SPAN_COVERAGE_FRACTION = 0.25
 # Strength of a segment is n sqrt(length) / (this + sigma): below it, sigma does not matter.
 SIGMA_FLOOR_M = 0.01
-# Few observations may agree by chance; events lie on whole pixels, and no line is seen better.
-LEAST_NOISE_PX = 0.05
+# Without any residual a line would be sure of whatever nothing tells.
+LEAST_NOISE_PX = 0.001
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

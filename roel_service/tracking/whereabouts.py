@@ -101,7 +101,7 @@ def _continued(path: list[MotionState], for_s: float) -> SE3:
     """
     last = path[-1]
     known_s = (last.t_us - path[0].t_us) * 1e-6
-    if len(path) < 2 or for_s > MAX_REPEAT_COUNT * known_s:
+    if known_s == 0.0 or for_s > MAX_REPEAT_COUNT * known_s:
         return last.poses(np.array(for_s))
     repeat_count = max(1, math.ceil(for_s / known_s))
     before_us = last.t_us - round(1e6 * for_s / repeat_count)
