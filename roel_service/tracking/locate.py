@@ -75,6 +75,8 @@ def locate(
     if len(lines.polarity) == 0:
         return []
     poses = _search(guess, lines, eyes, config, rng)
+    if not poses:
+        return []
     sampled = _sampled(lines, window.t_us).thinned(SAMPLED_COUNT)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
@@ -162,6 +164,8 @@ def _search(
     reach = np.array([np.deg2rad(config.reach_deg)] * 3 + [config.reach_m] * 3)
     cell_px = CELL_SHARE * focal_px
     points, direction = _scored(guess, eyes, config)
+    if len(points) == 0:  # nothing of the map is within sight
+        return []
     steps = _ball(TURN_STEP), _ball(SHIFT_STEP)
     tangents = np.array([np.concatenate(pair) for pair in itertools.product(*steps)]) * reach
     spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
