@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import signal
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -51,6 +52,20 @@ def raising(error: BaseException) -> Callable[[], None]:
 
 def test_work_that_ends_is_code_0(run_with: Callable[..., Outcome]) -> None:
     assert run_with(lambda: None) == (0, "", "")
+
+
+@pytest.mark.parametrize(("wanted", "had"), [(None, "1"), ("4", "4")])
+def test_linear_algebra_has_one_thread_unless_the_user_wants_more(
+    run_with: Callable[..., Outcome],
+    monkeypatch: pytest.MonkeyPatch,
+    wanted: str | None,
+    had: str,
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    if wanted:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", wanted)
+    _, out, _ = run_with(lambda: sys.stdout.write(os.environ["OPENBLAS_NUM_THREADS"]))
+    assert out.split() == [had]
 
 
 @pytest.mark.parametrize(

@@ -79,6 +79,8 @@ def run_staged(
     with staging(files) as staged:
 
         def work() -> int:
+            # It has threads of its own; those of linear algebra are busy with waiting for one another.
+            os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
             command.run(options, staged)
             log.flush()
             return DONE
