@@ -146,6 +146,7 @@ def test_a_trial_without_a_pose_is_not_right():
         margin=None,
         nees=None,
         seconds=0.1,
+        clock_seconds=0.2,
     )
     assert not localization_report.is_coarse(trial)
 
