@@ -3,7 +3,7 @@
 LIMAP triangulates, links, filters and refines; what it is given is made here: event frames, lines,
 matches, poses. Its package brings an OpenCV wheel that would overwrite this project's, and some of
 its checks abort the process, so it runs in an environment (`make limap`) and a process of its own,
-with arrays as files between (`limap_worker.py`).
+with arrays as files between (folder `in_limap`).
 
 Choices that make the comparison fair are in `limap_lines.py` and `LIMAP_SETTINGS`. The RoEL paper
 ran LIMAP with SOLD2, whose weights are downloaded at first use, on one image a frame with 60
@@ -48,7 +48,7 @@ from roel_service.scene.trajectory import Trajectory
 
 # The environment that `make limap` makes, and the script that runs in it.
 ENVIRONMENT = Path(__file__).parents[3] / ".venv-limap"
-WORKER = Path(__file__).with_name("limap_worker.py")
+WORKER = Path(__file__).parent / "in_limap" / "map_lines.py"
 LINES = ("lsd", "own")
 # Characters of the worker's last words that an error repeats.
 MAX_ERROR_LENGTH = 300
@@ -176,8 +176,7 @@ def solve(problem: Problem, settings: LimapSettings, python: Path) -> FloatArray
     with tempfile.TemporaryDirectory(prefix="roel-limap-") as folder:
         task, answer = Path(folder) / "problem.npz", Path(folder) / "answer.npz"
         write_problem(task, problem, settings)
-        # Isolated, or this folder's `limap.py` would be imported in place of the package.
-        run_worker([str(python), "-I", str(WORKER), str(task), str(answer)], settings.timeout_s)
+        run_worker([str(python), "-Es", str(WORKER), str(task), str(answer)], settings.timeout_s)
         return read_segments(answer)
 
 
@@ -341,22 +340,15 @@ def _pairs(neighbors: list[IntArray]) -> list[tuple[int, int]]:
 
 
 def write_problem(path: Path, problem: Problem, settings: LimapSettings) -> None:
-    """Write the arrays that `limap_worker.py` reads.
+    """Write the arrays that `in_limap/map_lines.py` reads.
 
     Pixel centres are at integers in lines and calibration alike, which LIMAP does not mind.
     """
-    frames = problem.frames
-    T_camera_world = frames.T_world_camera.inverse()
     pairs = sorted(problem.matches)
     matches = [problem.matches[pair] for pair in pairs]
-    K = frames.K
     np.savez(
         path,
-        width=frames.width,
-        height=frames.height,
-        pinhole_px=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]),
-        R_camera_world=T_camera_world.rotation,
-        t_camera_world=T_camera_world.translation,
+        **posed_images(problem.frames),
         segments_px=np.concatenate(problem.segments_px),
         line_offsets=_offsets(problem.segments_px),
         pairs=np.array(pairs, np.int64).reshape(-1, 2),
@@ -366,6 +358,18 @@ def write_problem(path: Path, problem: Problem, settings: LimapSettings) -> None
         neighbor_offsets=_offsets(problem.neighbors),
         options=json.dumps(worker_options(settings)),
     )
+
+
+def posed_images(frames: Frames) -> dict[str, Any]:
+    """The arrays that `in_limap/posed_images.py` reads."""
+    T_camera_world, K = frames.T_world_camera.inverse(), frames.K
+    return {
+        "width": frames.width,
+        "height": frames.height,
+        "pinhole_px": np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]),
+        "R_camera_world": T_camera_world.rotation,
+        "t_camera_world": T_camera_world.translation,
+    }
 
 
 def _offsets(parts: list[Any]) -> IntArray:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from roel_bench.peers.limap import ENVIRONMENT, run_worker
+from roel_bench.peers.limap import ENVIRONMENT, posed_images, run_worker
 from roel_service.arrays import Array, FloatArray
 from roel_service.errors import NoAnswerError, NotFoundError
 from roel_service.geometry import plucker
@@ -19,7 +19,7 @@ from roel_service.mapping.front_end import Detected
 from roel_service.mapping.refine import Refined
 from roel_service.mapping.views import cuts_m, views_of
 
-WORKER = Path(__file__).with_name("limap_poses_worker.py")
+WORKER = Path(__file__).parent / "in_limap" / "adjust_poses.py"
 ITERATION_COUNT = 200
 TIMEOUT_S = 600.0
 
@@ -47,25 +47,19 @@ def adjusted_poses(refined: Refined, detected: Detected, environment: Path = ENV
     with tempfile.TemporaryDirectory(prefix="roel-limap-") as folder:
         task, answer = Path(folder) / "problem.npz", Path(folder) / "answer.npz"
         write_problem(task, refined, detected)
-        run_worker([str(python), "-I", str(WORKER), str(task), str(answer)], TIMEOUT_S)
+        run_worker([str(python), "-Es", str(WORKER), str(task), str(answer)], TIMEOUT_S)
         return read_poses(answer, len(detected.frames))
 
 
 def write_problem(path: Path, refined: Refined, detected: Detected) -> None:
-    """Write the arrays that `limap_poses_worker.py` reads."""
+    """Write the arrays that `in_limap/adjust_poses.py` reads."""
     frames, observations, tracks = detected.frames, detected.observations, refined.tracks
-    T_camera_world = frames.T_world_camera.inverse()
     line_offsets = np.searchsorted(observations.frame, np.arange(len(frames) + 1))
     frame = observations.frame[tracks.observation].astype(np.int64)
     local = tracks.observation - line_offsets[frame]
-    K = frames.K
     np.savez(
         path,
-        width=frames.width,
-        height=frames.height,
-        pinhole_px=np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]),
-        R_camera_world=T_camera_world.rotation,
-        t_camera_world=T_camera_world.translation,
+        **posed_images(frames),
         segments_px=observations.segments_px,
         line_offsets=line_offsets,
         segments=seen_segments(refined, detected),

@@ -1,9 +1,9 @@
 """LIMAP's side of `limap_poses.py`: lines, their tracks and poses in, bundle-adjusted poses out.
 
-    python limap_poses_worker.py INPUT.npz OUTPUT.npz
+    python adjust_poses.py INPUT.npz OUTPUT.npz
 
-Runs in LIMAP's own environment and therefore imports nothing of this project. The arrays of the
-input are those of `limap_poses.write_problem`.
+Runs in LIMAP's own environment and therefore imports nothing of this project but its neighbours. The
+arrays of the input are those of `limap_poses.write_problem`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import numpy as np
 import pycolmap
 from limap import geometry, scene
 from limap.estimators import bundle_adjustment
-
-CAMERA_ID, FIRST_IMAGE_ID = 1, 1
+from posed_images import FIRST_IMAGE_ID, posed_images
 
 
 def main(input_path: Path, output_path: Path) -> None:
@@ -31,25 +30,6 @@ def main(input_path: Path, output_path: Path) -> None:
     images = holistic.point_recon.images
     poses = [images[k].cam_from_world().matrix() for k in sorted(images)]
     np.savez(output_path, T_camera_world=np.array(poses))
-
-
-def posed_images(problem: dict[str, Any]) -> pycolmap.Reconstruction:
-    """A COLMAP model of one pinhole camera and its poses, without points."""
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(
-        camera_id=CAMERA_ID,
-        model="PINHOLE",
-        width=int(problem["width"]),
-        height=int(problem["height"]),
-        params=problem["pinhole_px"],
-    )
-    reconstruction.add_camera_with_trivial_rig(camera)
-    poses = zip(problem["R_camera_world"], problem["t_camera_world"], strict=True)
-    for image_id, (rotation, translation) in enumerate(poses, start=FIRST_IMAGE_ID):
-        image = pycolmap.Image(name=f"{image_id}.png", camera_id=CAMERA_ID, image_id=image_id)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    return reconstruction
 
 
 def add_lines(holistic: scene.HolisticReconstruction, problem: dict[str, Any]) -> None:

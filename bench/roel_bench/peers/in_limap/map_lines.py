@@ -1,9 +1,9 @@
 """LIMAP's side of `limap.py`: 2D lines and their matches in, 3D segments out.
 
-    python limap_worker.py INPUT.npz OUTPUT.npz
+    python map_lines.py INPUT.npz OUTPUT.npz
 
-Runs in LIMAP's own environment and therefore imports nothing of this project. The arrays of the
-input are those of `limap.write_problem`; the output holds `segments` (L, 2, 3), world, m, and
+Runs in LIMAP's own environment and therefore imports nothing of this project but its neighbours. The
+arrays of the input are those of `limap.write_problem`; the output holds `segments` (L, 2, 3), world, m, and
 `observation_count` (L,).
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 import pycolmap
 from limap import geometry, scene, sfm
 from limap.estimators import bundle_adjustment
+from posed_images import posed_images
 
-CAMERA_ID = 1
 # LIMAP 1 refines with this many steps, LIMAP 2 with half of it.
 MAX_ITERATION_COUNT = 200
 
@@ -40,25 +40,6 @@ def main(input_path: Path, output_path: Path) -> None:
         segments=np.array(segments).reshape(-1, 2, 3),
         observation_count=np.array([line.track.length() for line in lines], np.int64),
     )
-
-
-def posed_images(problem: dict[str, Any]) -> pycolmap.Reconstruction:
-    """A COLMAP model of one pinhole camera and its poses, without points; images from 1."""
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(
-        camera_id=CAMERA_ID,
-        model="PINHOLE",
-        width=int(problem["width"]),
-        height=int(problem["height"]),
-        params=problem["pinhole_px"],
-    )
-    reconstruction.add_camera_with_trivial_rig(camera)
-    poses = zip(problem["R_camera_world"], problem["t_camera_world"], strict=True)
-    for image_id, (rotation, translation) in enumerate(poses, start=1):
-        image = pycolmap.Image(name=f"{image_id}.png", camera_id=CAMERA_ID, image_id=image_id)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    return reconstruction
 
 
 def triangulated(
