@@ -115,10 +115,16 @@ def class_of(directions: FloatArray, shared: FloatArray) -> Array:
     return np.where(sine.min(axis=1) < np.sin(MEMBER_RAD), nearest, -1)
 
 
-def principal_frame(shared: FloatArray) -> FloatArray:
-    """(3, 3) rotation whose rows are axes that follow the shared directions, strongest first."""
+def principal_frame(shared: FloatArray, directions: FloatArray) -> FloatArray:
+    """(3, 3) rotation whose rows are axes that follow the shared directions, strongest first.
+
+    Args:
+        shared: (D, 3) unit.
+        directions: (L, 3) unit, of all lines, longest first: where fewer than two are shared, they say
+            what turns with the map.
+    """
     rows: list[FloatArray] = []
-    for direction in [*shared, *np.eye(3)]:
+    for direction in [*shared, *directions, *np.eye(3)]:
         rest = direction - sum((row @ direction) * row for row in rows)
         if len(rows) < 2 and np.linalg.norm(rest) > MIN_CROSSING_SINE:
             rows.append(unit(rest))

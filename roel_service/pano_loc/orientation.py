@@ -27,7 +27,7 @@ MIN_EXPLAINED_SHARE = 0.6
 # Widths of the kernel while an orientation is refined.
 REFINE_WIDTHS_RAD = np.deg2rad([4.0, 3.0, 2.0, 1.5, 1.0, 1.0])
 # Around a single direction every orientation is tried in such steps.
-TURN_STEP_RAD = np.deg2rad(4.0)
+TURN_STEP_RAD = np.deg2rad(4.5)
 
 
 def rotation_hypotheses(
@@ -42,9 +42,12 @@ def rotation_hypotheses(
     With a prior, those near it, and its own.
     """
     seen = vanishing_directions(arcs)
+    max_count = config.max_rotation_count
     rotations = _aligned_pairs(seen, prepared.shared)
     if len(rotations) == 0:
-        rotations = _aligned_singles(seen, prepared.shared)
+        rotations = _aligned_singles(seen, prepared)
+        # None of them is more likely than the others.
+        max_count = max(max_count, len(rotations))
     if prior is not None:
         first = prior.T_world_picture.rotation
         near = rotations[rotation_angle(rotations @ first.T) < prior.reach_rad]
@@ -54,10 +57,11 @@ def rotation_hypotheses(
     if len(rotations) == 0:
         return rotations
     few = arcs.take(np.arange(min(len(arcs), SCORED_ARC_COUNT)))
-    rotations, explained = _distinct(rotations, _explained(rotations, few, prepared.shared), config)
+    explained = _explained(rotations, few, prepared.shared)
+    rotations, explained = _distinct(rotations, explained, max_count)
     rotations = _refined(rotations, few, prepared.shared)
     explained = _explained(rotations, few, prepared.shared)
-    rotations, explained = _distinct(rotations, explained, config)
+    rotations, explained = _distinct(rotations, explained, max_count)
     return np.asarray(rotations[explained >= MIN_EXPLAINED_SHARE * explained[0]])
 
 
@@ -86,13 +90,14 @@ def _frame(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.stack([ahead, across, np.cross(ahead, across)])
 
 
-def _aligned_singles(seen: FloatArray, shared: FloatArray) -> FloatArray:
+def _aligned_singles(seen: FloatArray, prepared: PreparedMap) -> FloatArray:
     """Rotations that lay the strongest seen direction on the map's, turned about it in steps."""
-    if len(seen) == 0 or len(shared) == 0:
+    if len(seen) == 0 or len(prepared.shared) == 0:
         return np.empty((0, 3, 3))
-    turns = rotation_from_vector(np.arange(0.0, 2.0 * np.pi, TURN_STEP_RAD)[:, None] * shared[0])
+    axis = prepared.frame[0]
+    turns = rotation_from_vector(np.arange(0.0, 2.0 * np.pi, TURN_STEP_RAD)[:, None] * axis)
     return np.concatenate(
-        [turns @ _basis(shared[0]).T @ _basis(sign * seen[0]) for sign in (1.0, -1.0)]
+        [turns @ prepared.frame.T @ _basis(sign * seen[0]) for sign in (1.0, -1.0)]
     )
 
 
@@ -110,12 +115,12 @@ def _explained(rotations: FloatArray, arcs: PanoramaArcs, shared: FloatArray) ->
 
 
 def _distinct(
-    rotations: FloatArray, explained: FloatArray, config: LocalizeConfig
+    rotations: FloatArray, explained: FloatArray, max_count: int
 ) -> tuple[FloatArray, FloatArray]:
     """The best rotations, each the only one of its neighbourhood, best first."""
     left = np.argsort(-explained, kind="stable")
     kept: list[int] = []
-    while len(left) and len(kept) < config.max_rotation_count:
+    while len(left) and len(kept) < max_count:
         kept.append(int(left[0]))
         turned_rad = rotation_angle(rotations[left] @ rotations[left[0]].T)
         left = left[turned_rad >= SAME_ROTATION_RAD]

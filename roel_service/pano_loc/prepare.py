@@ -109,7 +109,7 @@ def prepare_map(line_map: LineMap, config: LocalizeConfig) -> PreparedMap:
     directions = unit(segments[:, 1] - segments[:, 0])
     shared = shared_directions(directions, length_m)
     channel = class_of(directions, shared[:MAX_CHANNEL_COUNT])
-    frame = principal_frame(shared)
+    frame = principal_frame(shared, directions)
     lines = classed_lines(segments, channel, class_frames(shared[:MAX_CHANNEL_COUNT], frame))
     places, step_m = free_places(segments, frame, config.grid_step_m)
     return PreparedMap(

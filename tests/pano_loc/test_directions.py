@@ -41,7 +41,14 @@ def test_vanishing_directions_are_those_of_the_room():
 
 def test_principal_frame_is_a_rotation_however_many_directions_there_are():
     for count in range(4):
-        frame = principal_frame(SLANTED[:count])
+        frame = principal_frame(SLANTED[:count], np.empty((0, 3)))
         np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(frame) > 0
         assert count == 0 or np.allclose(frame[0], SLANTED[0])
+
+
+def test_where_one_direction_is_shared_the_longest_line_beside_it_says_what_turns_with_the_map():
+    lines = unit(np.array([SLANTED[0], SLANTED[0] + 0.01, SLANTED[1], SLANTED[2]]))
+    frame = principal_frame(SLANTED[:1], lines)
+    np.testing.assert_allclose(frame[0], SLANTED[0])
+    np.testing.assert_allclose(frame[1], [0.0, 1.0, 0.0], atol=1e-12)

@@ -73,6 +73,19 @@ def test_the_answer_moves_with_the_map(room, motion):
     assert np.degrees(rotation_errors_rad(there.T_world_panorama, expected)) < 0.05
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_map_of_uprights_alone_is_enough_however_it_lies(seed):
+    segments = segments_of()
+    ends = segments[:, 1] - segments[:, 0]
+    uprights = segments[ends[:, 2] != 0.0]
+    # One line that is none, too short for a direction that counts: it turns with the map.
+    lone = np.array([[[0.1, 0.5, 0.75], [0.8, 0.6, 0.75]]])
+    motion = pose(*np.random.default_rng(seed).uniform(-3.0, 3.0, 6))
+    line_map = LineMap.from_segments(np.concatenate([uprights, lone])).transformed(motion)
+    arcs = seen_from(POSES[2], segments, noise_rad=NOISE_RAD)
+    require_pose(localize_arcs(arcs, [prepare_map(line_map, CONFIG)], CONFIG), motion @ POSES[2])
+
+
 def test_the_answer_turns_with_the_panorama(room):
     turn = pose(0, 0, 0, 0.0, 0.0, 1.1)
     arcs = [seen_from(truth, segments_of(), noise_rad=0.0) for truth in (POSES[0], POSES[0] @ turn)]
