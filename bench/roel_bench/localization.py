@@ -385,7 +385,8 @@ def off_axes_deg(line_map: LineMap) -> float:
     """The least rotation that lays the axes of the map's lines on those of the world."""
     segments = line_map.segments
     directions = unit(segments[:, 1] - segments[:, 0])
-    frame = principal_frame(shared_directions(directions, line_map.lengths_m))
+    longest = directions[np.argsort(-line_map.lengths_m, kind="stable")]
+    frame = principal_frame(shared_directions(directions, line_map.lengths_m), longest)
     angles = [rotation_angle(turn @ frame) for turn in _axis_turns()]
     return float(np.degrees(min(angles)))
 

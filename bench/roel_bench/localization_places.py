@@ -31,6 +31,8 @@ ROOM, HOUSE_ROOM, HOUSE, HOUSE_OUTSIDE, SYMMETRIC = (
     "symmetric",
 )
 MAX_POSES_BYTES = 1 << 20
+# Mapped from events of a photograph; looked at, too.
+REAL_ROOM = "events_room01"
 # Ends the name of a room whose map's lines were cut in pieces, to have a map of many lines.
 IN_PIECES = "_in_pieces"
 
@@ -80,7 +82,7 @@ class Place:
 def room(name: str, line_map: LineMap, folder: Path) -> Place:
     """A map of a room and a folder of panoramas as `roel simulate` writes it."""
     panoramas = tuple(panorama for _, panorama in _panoramas(folder))
-    is_tuning = name.removesuffix(IN_PIECES) in TUNING_PLACES
+    is_tuning = name.removesuffix(IN_PIECES) in (*TUNING_PLACES, REAL_ROOM)
     return Place(name=name, kind=ROOM, line_map=line_map, panoramas=panoramas, is_tuning=is_tuning)
 
 

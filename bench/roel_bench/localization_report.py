@@ -46,7 +46,7 @@ panoramas are 2048x1024, every fourth one tilted by up to 20 degrees. `fgpl` is 
 what its released code does otherwise. `fine` is the share within {FINE_M:g} m and {FINE_DEG:g} degrees, `coarse` that within {COARSE_M:g} m
 and {COARSE_DEG:g} degrees, of the best pose; an answer without a pose is a failure, and no panorama is left out. Medians are
 those of the answers with a pose. Places marked * were looked at when parameters were chosen; the others were not.
-`room_11_in_pieces` is a map of `room_11` with every line cut in three and its ends moved by 3 mm.
+`room_11_in_pieces` is a map of `room_11` with every line cut in four and its ends moved by 3 mm.
 """
 
 
