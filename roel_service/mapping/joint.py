@@ -48,6 +48,8 @@ SystemArguments = tuple[Array, Array, Array, Array, Array, Array, Array, Array, 
 
 # Steps that are tried, each damped more, before the present state counts as the best one.
 MAX_TRIAL_COUNT = 6
+# Errors that all observations of a line have in common feign a drift of so much in exact poses.
+FEIGNED_DRIFT = Drift(sigma_rad=float(np.deg2rad(0.03)), sigma_m=1e-3, forgets_s=1.0)
 # An estimated drift is at least this share of the configured one.
 LEAST_DRIFT_SHARE = 0.01
 # A step that lowers the cost by less than this share ends the iteration.
@@ -554,7 +556,7 @@ class _Problem:
         covariance = np.asarray(np.linalg.inv(reduced.hessian), dtype=np.float64)
         told = state.drift.estimated(state.correction, covariance)
         configured = Drift.configured(self.config)
-        drift = told.at_least(LEAST_DRIFT_SHARE, configured)
+        drift = told.beyond(FEIGNED_DRIFT).at_least(LEAST_DRIFT_SHARE, configured)
         # The path's size and shape are what lines hold least: its drift would feed on itself.
         drift = replace(drift, sigma_m=min(drift.sigma_m, configured.sigma_m))
         return replace(state, drift=drift, drift_told=told)

@@ -157,6 +157,14 @@ class Drift:
             sigmas.append(float(np.sqrt(size / known_count)))
         return replace(self, sigma_rad=sigmas[0], sigma_m=sigmas[1])
 
+    def beyond(self, other: Drift) -> Drift:
+        """What is left of it, where a part of its variance is another's."""
+        return replace(
+            self,
+            sigma_rad=float(np.sqrt(max(self.sigma_rad**2 - other.sigma_rad**2, 0.0))),
+            sigma_m=float(np.sqrt(max(self.sigma_m**2 - other.sigma_m**2, 0.0))),
+        )
+
     def at_least(self, share: float, other: Drift) -> Drift:
         """With deviations of no less than a share of another drift's."""
         return replace(

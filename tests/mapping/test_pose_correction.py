@@ -90,6 +90,14 @@ def test_the_size_of_a_drift_is_found_from_a_correction():
     assert true.at_least(0.5, expected).sigma_m == 0.5
 
 
+def test_what_lies_beyond_another_drift_is_the_rest_of_its_variance():
+    small = Drift(sigma_rad=0.03, sigma_m=0.004, forgets_s=9.0)
+    rest = Drift(sigma_rad=0.05, sigma_m=0.003, forgets_s=1.5).beyond(small)
+    assert rest.sigma_rad == pytest.approx(0.04)
+    assert rest.sigma_m == 0.0
+    assert rest.forgets_s == 1.5
+
+
 def test_too_long_a_recording_is_refused():
     with pytest.raises(LimitError, match=r"at most 1 s at refine\.pose_interval_us") as caught:
         PoseCorrection.none(trajectory(), 1_000)
