@@ -7,6 +7,7 @@ pose of its own time; the motion model's forecast is their prior.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -174,87 +175,134 @@ def window_of(events: EventSlice, ideal_px: Array, span_us: tuple[int, int], mos
     )
 
 
+class _Motion(NamedTuple):
+    """Pose and velocity as loops over events take them: rotation, centre and (6,) velocity."""
+
+    rotation: FloatArray
+    centre: FloatArray
+    velocity: FloatArray
+
+    @staticmethod
+    def of(state: MotionState) -> _Motion:
+        pose = state.T_world_camera
+        return _Motion(pose.rotation, pose.translation, state.velocity)
+
+    def stepped(self, step: FloatArray) -> _Motion:
+        """With pose and velocity changed by (12,)."""
+        rotation, centre = image_kernels.retracted(self.rotation, self.centre, step[None, :6])
+        return _Motion(rotation[0], centre[0], self.velocity + step[6:])
+
+    def poses(self, after_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(N, 3, 3) rotations and (N, 3) centres so many seconds later, were the motion even."""
+        steps = after_s[:, None] * self.velocity
+        return image_kernels.retracted(self.rotation, self.centre, steps)
+
+
 class _Association:
     """Events beside the lines that are near them in the picture of one pose."""
 
     def __init__(
-        self, state: MotionState, window: Window, pieces: MapPieces, view: View, reach_px: float
+        self,
+        motion: _Motion,
+        window: Window,
+        pieces: MapPieces,
+        view: View,
+        config: TrackConfig,
+        scale_px: float,
     ) -> None:
-        pose = state.T_world_camera
-        self.images, self.depths_m = image_kernels.project(
+        self.images, depths_m = image_kernels.project(
             pieces.segments,
-            pose.rotation,
-            pose.translation,
+            motion.rotation,
+            motion.centre,
             view.K,
             view.width,
             view.height,
             MIN_DEPTH_SHARE * pieces.extent_m,
         )
+        reach_px = BESIDE[1] * scale_px
         nearest = image_kernels.draw_nearest(self.images, reach_px, view.width, view.height)
-        turned = pose.rotation.T @ state.poses(window.slot_s).rotation
+        turned = motion.rotation.T @ motion.poses(window.slot_s)[0]
         homographies = view.K @ turned @ np.linalg.inv(view.K)
         piece = image_kernels.pieces_near(window.xy_px, window.slot, homographies, nearest)
-        near = piece != image_kernels.NO_PIECE
+        near = np.flatnonzero(piece != image_kernels.NO_PIECE)
         self.piece = piece[near]
         self.xy_px, self.slot = window.xy_px[near], window.slot[near]
         self.slot_s = window.slot_s
         self.after_s = window.slot_s[self.slot]
         self.edge = pieces.edge[self.piece]
+        across = self.images[:, 2:] - self.images[:, :2]
+        # (P,) what is seen of each piece.
+        self.length_px = np.hypot(across[:, 0], across[:, 1])
+        self._line_px2 = _line_variance_px2(depths_m, view, config)
+        self._event_px2 = (config.event_noise_px * scale_px) ** 2
+        self._scale_px = scale_px
         self._pieces, self._K = pieces, view.K
 
-    @property
-    def length_px(self) -> FloatArray:
-        """(P,) what is seen of each piece."""
-        across = self.images[:, 2:] - self.images[:, :2]
-        return np.asarray(np.hypot(across[:, 0], across[:, 1]), np.float64)
-
-    def speeds_px_per_s(self, state: MotionState) -> FloatArray:
+    def speeds_px_per_s(self, motion: _Motion) -> FloatArray:
         """(P,) speed of the image of each piece across itself, in its middle."""
-        return np.asarray(np.abs(self.by_pose(state) @ state.velocity))
+        return np.asarray(np.abs(self.by_pose(motion) @ motion.velocity))
 
-    def by_pose(self, state: MotionState) -> FloatArray:
+    def by_pose(self, motion: _Motion) -> FloatArray:
         """(P, 6) how the image of each piece goes across itself when the pose steps, px."""
-        pose = state.T_world_camera
         count = len(self.images)
         _, by_pose = image_kernels.distances(
             0.5 * (self.images[:, :2] + self.images[:, 2:]),
             np.zeros(count, np.int64),
             np.arange(count, dtype=np.int32),
-            pose.rotation[None],
-            pose.translation[None],
+            motion.rotation[None],
+            motion.centre[None],
             self._K,
             self._pieces.segments,
             self._pieces.direction,
         )
         return np.asarray(by_pose, np.float64)
 
-    def support(
-        self, residual_px: FloatArray, scale_px: float
-    ) -> tuple[IntArray, IntArray, FloatArray]:
+    def support(self, residual_px: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
         """For each piece (P,) events on it, beside it, and the share of its parts with events."""
         return image_kernels.support(
             self.xy_px,
             self.piece,
             residual_px,
             self.images,
-            INNER * scale_px,
-            (BESIDE[0] * scale_px, BESIDE[1] * scale_px),
+            INNER * self._scale_px,
+            (BESIDE[0] * self._scale_px, BESIDE[1] * self._scale_px),
             BIN_PX,
         )
 
-    def distances(self, state: MotionState) -> tuple[FloatArray, FloatArray]:
+    def distances(self, motion: _Motion) -> tuple[FloatArray, FloatArray]:
         """(K,) distances (px) and (K, 6) derivatives by a step of the pose at the event's time."""
-        poses = state.poses(self.slot_s)
         return image_kernels.distances(
             self.xy_px,
             self.slot,
             self.piece,
-            poses.rotation,
-            poses.translation,
+            *motion.poses(self.slot_s),
             self._K,
             self._pieces.segments,
             self._pieces.direction,
         )
+
+    def weights(self, residual_px: FloatArray, seen: BoolArray) -> FloatArray:
+        """(K,) weights of the events, 1/px^2: those of lines that are seen, near enough.
+
+        A line's own error is shared by all of its events: together they weigh no more than it
+        allows.
+        """
+        return image_kernels.event_weights(
+            residual_px,
+            self.piece,
+            seen & (self.length_px >= MIN_LENGTH_PX),
+            self._line_px2,
+            self._event_px2,
+            REACH * self._scale_px,
+        )
+
+
+def _line_variance_px2(depths_m: FloatArray, view: View, config: TrackConfig) -> FloatArray:
+    """(P,) variance of a line as a whole: in the picture, and in the map at its depth."""
+    depths_m = np.where(depths_m > 0.0, depths_m, np.inf)
+    return np.asarray(
+        config.line_noise_px**2 + np.square(config.line_noise_m * view.K[0, 0] / depths_m)
+    )
 
 
 def fit_window(
@@ -276,27 +324,27 @@ def fit_window(
     if window.is_quiet:
         forecast = _at_rest(forecast, window.span_s, pieces, view)
     prior_information = np.linalg.inv(forecast.covariance)
-    state, step = forecast, np.zeros(12)
+    begin = motion = _Motion.of(forecast)
+    step = np.zeros(12)
     for scale_px in scales_px:
-        association = _Association(state, window, pieces, view, BESIDE[1] * scale_px)
+        association = _Association(motion, window, pieces, view, config, scale_px)
         for _ in range(STEPS_PER_ROUND):
-            residual_px, by_pose = association.distances(state)
-            support = association.support(residual_px, scale_px)
-            weight = _weights(association, residual_px, support, view, scale_px, config)
+            residual_px, by_pose = association.distances(motion)
+            seen = _seen(*association.support(residual_px))
+            weight = association.weights(residual_px, seen)
             information, slope = image_kernels.normal_equations(
                 residual_px, by_pose, association.after_s, weight
             )
             if known is not None:
-                silent = known & ~_seen(*support)
-                _add_silence(information, slope, association, silent, state, window.span_s)
+                _add_silence(information, slope, association, known & ~seen, motion, window.span_s)
             covariance = np.linalg.inv(information + prior_information)
             step = step - covariance @ (slope + prior_information @ step)
-            state = forecast.stepped(step, covariance)
+            motion = begin.stepped(step)
     return WindowFit(
-        state=state,
+        state=forecast.stepped(step, covariance),
         surprise=float(np.sqrt(step @ prior_information @ step)),
-        evidence=_evidence(association, state, scales_px[-1], window.span_s),
-        seen=_seen(*support),
+        evidence=_evidence(association, motion, window.span_s),
+        seen=seen,
         information=information,
         information_of_edges=_by_edge(association, by_pose, weight),
     )
@@ -304,33 +352,17 @@ def fit_window(
 
 def _by_edge(association: _Association, by_pose: FloatArray, weight: FloatArray) -> FloatArray:
     """(E, 12, 12) information of each edge that has events."""
-    known, edge = np.unique(association.edge, return_inverse=True)
+    has_events = np.bincount(association.edge) > 0
+    place = np.cumsum(has_events) - 1
     return np.asarray(
-        image_kernels.information_by_edge(by_pose, association.after_s, weight, edge, len(known))
+        image_kernels.information_by_edge(
+            by_pose,
+            association.after_s,
+            weight,
+            place[association.edge],
+            int(np.count_nonzero(has_events)),
+        )
     )
-
-
-def _weights(
-    association: _Association,
-    residual_px: FloatArray,
-    support: tuple[IntArray, IntArray, FloatArray],
-    view: View,
-    scale_px: float,
-    config: TrackConfig,
-) -> FloatArray:
-    """(K,) weights of the events, 1/px^2: those of lines that are seen, near enough.
-
-    A line's own error is shared by all of its events: together they weigh no more than it allows.
-    """
-    count = len(association.images)
-    near = np.maximum(0.0, 1.0 - np.square(residual_px / (REACH * scale_px)))
-    seen = _seen(*support) & (association.length_px >= MIN_LENGTH_PX)
-    tukey = np.square(near) * seen[association.piece]
-    weight_of_piece = np.bincount(association.piece, tukey, count)
-    depth_m = np.where(association.depths_m > 0.0, association.depths_m, np.inf)
-    line_px2 = config.line_noise_px**2 + np.square(config.line_noise_m * view.K[0, 0] / depth_m)
-    event_px2 = (config.event_noise_px * scale_px) ** 2
-    return np.asarray(tukey / (event_px2 + weight_of_piece * line_px2)[association.piece])
 
 
 def _add_silence(
@@ -338,7 +370,7 @@ def _add_silence(
     slope: FloatArray,
     association: _Association,
     silent: BoolArray,
-    state: MotionState,
+    motion: _Motion,
     span_s: float,
 ) -> None:
     """Add what lines without events say, which is that they do not move across themselves.
@@ -346,8 +378,8 @@ def _add_silence(
     Where all lines of a direction rest in the picture, nothing else holds the motion across them.
     """
     silent = silent & (association.length_px >= MIN_LENGTH_PX)
-    by_velocity = span_s * association.by_pose(state)[silent]
-    motion_px = by_velocity @ state.velocity
+    by_velocity = span_s * association.by_pose(motion)[silent]
+    motion_px = by_velocity @ motion.velocity
     near = np.maximum(0.0, 1.0 - np.square(motion_px / (REACH * SILENT_PX)))
     # They rest for one reason, and together say no more than one of them does.
     weight = np.square(near) / (SILENT_PX**2 * max(1, len(near)))
@@ -375,13 +407,11 @@ def _at_rest(forecast: MotionState, span_s: float, pieces: MapPieces, view: View
     return forecast.stepped(-gain @ forecast.velocity, 0.5 * (covariance + covariance.T))
 
 
-def _evidence(
-    association: _Association, state: MotionState, scale_px: float, interval_s: float
-) -> Evidence:
-    residual_px, _ = association.distances(state)
-    on, beside, occupied = association.support(residual_px, scale_px)
+def _evidence(association: _Association, motion: _Motion, interval_s: float) -> Evidence:
+    residual_px, _ = association.distances(motion)
+    on, beside, occupied = association.support(residual_px)
     length_px = association.length_px
-    motion_px = interval_s * association.speeds_px_per_s(state)
+    motion_px = interval_s * association.speeds_px_per_s(motion)
     tells = (length_px >= MIN_LENGTH_PX) & (motion_px >= MIN_MOTION_PX)
     seen = tells & _seen(on, beside, occupied)
     return Evidence(

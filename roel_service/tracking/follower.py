@@ -54,10 +54,15 @@ class Follower:
     def state(self) -> MotionState:
         return self.fit.state
 
+    @property
+    def before(self) -> float:
+        """How many times the last window counts in `explained_count`."""
+        explained_count = self.fit.evidence.explained_count
+        return self.explained_count / explained_count if explained_count else 1.0
+
     def instead(self, fit: WindowFit) -> Follower:
         """Another answer for the last window, as if it had been followed so far."""
-        explained_count = self.fit.evidence.explained_count
-        return Follower(fit, self.explained_count / explained_count if explained_count else 1.0)
+        return Follower(fit, self.before)
 
     def follow(self, window: Window, eyes: Eyes, config: TrackConfig) -> None:
         """Go on to the next window."""

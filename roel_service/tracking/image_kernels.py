@@ -7,10 +7,12 @@ import math
 import numba
 import numpy as np
 
-from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.arrays import Array, BoolArray, FloatArray, IntArray
 
 # Nothing of the map is near a pixel.
 NO_PIECE = -1
+# Below this square of an angle, sin(x)/x and its relatives are told by their series.
+SMALL_SQUARE_RAD2 = 1e-8
 # Parts of a piece of which it is noted whether events lie on them; bits of a 64-bit number.
 MAX_BIN_COUNT = 64
 
@@ -114,6 +116,36 @@ def draw_nearest(images: FloatArray, reach_px: float, width: int, height: int) -
 
 
 @numba.njit(cache=True, nogil=True)
+def retracted(
+    R_world_camera: FloatArray, centre: FloatArray, steps: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(N, 3, 3) rotations and (N, 3) centres of one pose after each of (N, 6) steps (r, d)."""
+    rotations, centres = np.empty((len(steps), 3, 3)), np.empty((len(steps), 3))
+    for n in range(len(steps)):
+        x, y, z = steps[n, 0], steps[n, 1], steps[n, 2]
+        square = x * x + y * y + z * z
+        if square < SMALL_SQUARE_RAD2:
+            sine, cosine = 1.0 - square / 6.0, 0.5 - square / 24.0
+        else:
+            angle = math.sqrt(square)
+            sine, cosine = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
+        for column in range(3):
+            a, b, c = (
+                R_world_camera[0, column],
+                R_world_camera[1, column],
+                R_world_camera[2, column],
+            )
+            # Rodrigues: v + sine (r x v) + cosine (r x (r x v)).
+            u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+            rotations[n, 0, column] = a + sine * u + cosine * (y * w - z * v)
+            rotations[n, 1, column] = b + sine * v + cosine * (z * u - x * w)
+            rotations[n, 2, column] = c + sine * w + cosine * (x * v - y * u)
+        for i in range(3):
+            centres[n, i] = centre[i] + steps[n, 3 + i]
+    return rotations, centres
+
+
+@numba.njit(cache=True, nogil=True)
 def pieces_near(
     xy_px: FloatArray, slot: IntArray, homographies: FloatArray, nearest: Array
 ) -> Array:
@@ -179,7 +211,7 @@ def distances(
         qx = R[0, 0] * mx + R[1, 0] * my + R[2, 0] * mz
         qy = R[0, 1] * mx + R[1, 1] * my + R[2, 1] * mz
         qz = R[0, 2] * mx + R[1, 2] * my + R[2, 2] * mz
-        length = max(math.hypot(qx, qy), 1e-12)
+        length = max(math.sqrt(qx * qx + qy * qy), 1e-12)
         x, y = (xy_px[k, 0] - K[0, 2]) / K[0, 0], (xy_px[k, 1] - K[1, 2]) / K[1, 1]
         sine = (x * qx + y * qy + qz) / length
         residual_px[k] = focal_px * sine
@@ -196,6 +228,37 @@ def distances(
         jacobian[k, 4] = gz * v[0] - gx * v[2]
         jacobian[k, 5] = gx * v[1] - gy * v[0]
     return residual_px, jacobian
+
+
+@numba.njit(cache=True, nogil=True)
+def event_weights(
+    residual_px: FloatArray,
+    piece: Array,
+    counts: BoolArray,
+    line_px2: FloatArray,
+    event_px2: float,
+    reach_px: float,
+) -> FloatArray:
+    """(K,) weights of events, 1/px^2: Tukey's, over the variance of all of a piece together.
+
+    Args:
+        residual_px: (K,) distances from the pieces.
+        piece: (K,) of each event.
+        counts: (P,) whether a piece has a say.
+        line_px2: (P,) variance of a piece, which all of its events share.
+        event_px2: variance of one event.
+        reach_px: events farther away have no weight.
+    """
+    weight = np.zeros(len(residual_px))
+    sums = np.zeros(len(counts))
+    for k in range(len(residual_px)):
+        if counts[piece[k]]:
+            near = max(0.0, 1.0 - (residual_px[k] / reach_px) ** 2)
+            weight[k] = near * near
+            sums[piece[k]] += weight[k]
+    for k in range(len(residual_px)):
+        weight[k] /= event_px2 + sums[piece[k]] * line_px2[piece[k]]
+    return weight
 
 
 @numba.njit(cache=True, nogil=True)

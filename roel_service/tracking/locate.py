@@ -7,8 +7,7 @@ left is fitted to the space-time planes of the lines, which tell the velocity to
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 
 import cv2
 import numpy as np
@@ -47,19 +46,21 @@ FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
 LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
 UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
+# Fits to the events of a window in a slice of the work.
+SLICE_FIT_COUNT = 4
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0
 
 
-def locate(
+def locating(
     guess: SE3,
     sight: Sight,
     window: Window,
     eyes: Eyes,
     config: TrackConfig,
     rng: np.random.Generator,
-) -> list[WindowFit]:
+) -> Generator[None, None, list[WindowFit]]:
     """States in the middle of a window, within the configured reach of a guess, the best first.
 
     Args:
@@ -68,16 +69,15 @@ def locate(
         window: the events of one interval.
         rng: draws the poses that are tried.
 
+    Yields:
+        Nothing, between slices of the work, of about the same length.
+
     Returns:
         Fits that lie apart, however poor; none where no line is seen.
     """
-    lines = sight.lines
-    if len(lines.polarity) == 0:
-        return []
-    poses = _search(guess, lines, eyes, config, rng)
-    if not poses:
-        return []
-    sampled = _sampled(lines, window.t_us).thinned(SAMPLED_COUNT)
+    poses = yield from _searching(guess, sight.lines, eyes, config, rng)
+    yield
+    sampled = _sampled(sight.lines, window.t_us).thinned(SAMPLED_COUNT)
     fits = [
         fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
         for state in (
@@ -85,10 +85,14 @@ def locate(
         )
     ]
     best = distinct(sorted(fits, key=explained_count, reverse=True))
-    on_events = [
-        fit_window(fit.state, window, eyes.pieces, eyes.view, config, UNSURE_SCALES_PX)
-        for fit in best
-    ]
+    yield
+    on_events: list[WindowFit] = []
+    for fit in best:
+        if len(on_events) == SLICE_FIT_COUNT:
+            yield
+        on_events.append(
+            fit_window(fit.state, window, eyes.pieces, eyes.view, config, UNSURE_SCALES_PX)
+        )
     return distinct(sorted(on_events, key=explained_count, reverse=True))
 
 
@@ -156,18 +160,17 @@ def _sampled(lines: FittedLines, t_us: int) -> Window:
     )
 
 
-def _search(
+def _searching(
     guess: SE3, lines: FittedLines, eyes: Eyes, config: TrackConfig, rng: np.random.Generator
-) -> list[SE3]:
+) -> Generator[None, None, list[SE3]]:
     """The most likely poses within reach of a guess, some apart from each other."""
     focal_px = float(np.sqrt(eyes.view.K[0, 0] * eyes.view.K[1, 1]))
     reach = np.array([np.deg2rad(config.reach_deg)] * 3 + [config.reach_m] * 3)
     cell_px = CELL_SHARE * focal_px
     points, direction = _scored(guess, eyes, config)
-    if len(points) == 0:  # nothing of the map is within sight
+    if len(points) == 0 or len(lines.polarity) == 0:
         return []
-    steps = _ball(TURN_STEP), _ball(SHIFT_STEP)
-    tangents = np.array([np.concatenate(pair) for pair in itertools.product(*steps)]) * reach
+    tangents = _grid() * reach
     spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
     for share in NEARNESS_SHARES:
         fields = _fields(lines.segments_px, share * focal_px, cell_px, eyes.view)
@@ -179,14 +182,19 @@ def _search(
             direction,
             eyes.view.K,
             fields,
+            fields.mean(axis=(1, 2), dtype=np.float64),
+            fields.var(axis=(1, 2), dtype=np.float64),
             cell_px,
             MIN_DEPTH_SHARE * eyes.pieces.extent_m,
         )
         tangents = tangents[np.argsort(-score, kind="stable")[:KEPT_COUNT]]
+        if share == NEARNESS_SHARES[0]:
+            # It takes as long as the others together.
+            yield
         if share != NEARNESS_SHARES[-1]:
             spread = 0.5 * spread
             noise = rng.normal(size=(len(tangents), CHILD_COUNT, 6)) * spread
-            children = (tangents[:, None] + noise).reshape(-1, 6)
+            children = _within_reach((tangents[:, None] + noise).reshape(-1, 6) / reach) * reach
             tangents = np.concatenate([tangents, children])
     return [guess.retract(tangent) for tangent in _apart(tangents / reach) * reach]
 
@@ -205,6 +213,21 @@ def _scored(guess: SE3, eyes: Eyes, config: TrackConfig) -> tuple[FloatArray, Fl
     chosen = np.flatnonzero(may_be_seen)
     chosen = chosen[:: max(1, -(-len(chosen) // SCORED_COUNT))]
     return middles[chosen], pieces.direction[chosen]
+
+
+def _within_reach(shares: FloatArray) -> FloatArray:
+    """(n, 6) tangents, as shares of the reach, none of them beyond it."""
+    parts = shares.reshape(-1, 2, 3)
+    beyond = np.maximum(1.0, np.linalg.norm(parts, axis=2, keepdims=True))
+    return np.asarray((parts / beyond).reshape(-1, 6))
+
+
+def _grid() -> FloatArray:
+    """(n, 6) tangents of the first round's poses, as shares of the reach."""
+    turns, shifts = _ball(TURN_STEP), _ball(SHIFT_STEP)
+    return np.concatenate(
+        [np.repeat(turns, len(shifts), axis=0), np.tile(shifts, (len(turns), 1))], axis=1
+    )
 
 
 def _ball(step: float) -> FloatArray:

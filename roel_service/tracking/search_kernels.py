@@ -18,16 +18,21 @@ def scores(
     direction: FloatArray,
     K: FloatArray,
     fields: Array,
+    mean: FloatArray,
+    variance: FloatArray,
     cell_px: float,
     min_depth_m: float,
 ) -> FloatArray:
-    """(B,) mean nearness of the map's points in view to seen lines of their direction.
+    """(B,) how much nearer the map's points in view are to seen lines of their direction than by chance.
+
+    That is, in deviations: of few points in view, many lie near a line by chance.
 
     Args:
         R_world_camera, centres: (B, 3, 3), (B, 3) poses.
         points, direction: (S, 3) of the map, and the unit directions of their lines.
         K: (3, 3) px.
         fields: (A, h, w) float32, for each of A directions of half a turn how near a line is.
+        mean, variance: (A,) of the fields.
         cell_px: pixels of a cell of the fields.
         min_depth_m: nearer points do not count.
     """
@@ -35,7 +40,7 @@ def scores(
     result = np.zeros(len(centres))
     for b in range(len(centres)):
         R, c = R_world_camera[b], centres[b]
-        total, count = 0.0, 0
+        beyond_chance, by_chance = 0.0, 0.0
         for s in range(len(points)):
             dx, dy, dz = points[s, 0] - c[0], points[s, 1] - c[1], points[s, 2] - c[2]
             z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
@@ -53,8 +58,7 @@ def scores(
             vz = R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2]
             angle = math.atan2(vy - y * vz, vx - x * vz)
             place = math.floor(angle / math.pi * class_count + 0.5) % class_count
-            total += fields[place, int(row), int(column)]
-            count += 1
-        # Poses that see hardly anything are not good ones.
-        result[b] = total / max(count, 0.05 * len(points))
+            beyond_chance += fields[place, int(row), int(column)] - mean[place]
+            by_chance += variance[place]
+        result[b] = beyond_chance / math.sqrt(by_chance) if by_chance > 0.0 else 0.0
     return result

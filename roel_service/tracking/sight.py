@@ -29,9 +29,11 @@ from roel_service.tracking.pieces import MapPieces
 # While nothing undoes the motion: one window, and a short one.
 BLURRED_FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
 BLURRED_DETECT = DetectConfig(window_events_per_pixel=(0.1,))
-SHARP_FRAMES, SHARP_DETECT = FramesConfig(), DetectConfig()
+SHARP_FRAMES, SHARP_DETECT = FramesConfig(), DetectConfig(window_events_per_pixel=(0.2,))
+# Nobody asks for the events of a line: the fewest are gathered.
+PLANES = PlaneFitConfig(support_event_count=1, support_half_window_us=1)
 # So many lines are enough to tell a place, and planes are fitted to no more.
-MAX_LINE_COUNT = 80
+MAX_LINE_COUNT = 100
 # A turn is taken to be even for so long around a moment.
 EVEN_US = 100_000
 # Speeds of lines are known about so well; a camera turns about so fast.
@@ -99,7 +101,7 @@ def _lines(
     longest = slice(0, MAX_LINE_COUNT)
     seeds = Seeds(segments_px=seeds.segments_px[longest], polarity=seeds.polarity[longest])
     # The planes are voted for: nothing is drawn.
-    return fit_space_time_planes(seeds, frame, PlaneFitConfig(), np.random.default_rng(0))
+    return fit_space_time_planes(seeds, frame, PLANES, np.random.default_rng(0))
 
 
 def _turning(t_us: int, turn_rate: FloatArray) -> Trajectory:

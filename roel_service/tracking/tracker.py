@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
 
+from roel_service.arrays import FloatArray
 from roel_service.config.stages import TrackConfig
 from roel_service.errors import EventsError
 from roel_service.geometry.projection import undistortion_table
@@ -15,20 +17,20 @@ from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventStream, time_not_monotone
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
-from roel_service.tracking.challenge import challengers
 from roel_service.tracking.fit import View, Window, WindowFit, window_of
-from roel_service.tracking.follower import Follower, rivals
-from roel_service.tracking.locate import locate
 from roel_service.tracking.pieces import pieces_of
-from roel_service.tracking.sight import Eyes, glimpse, look
-from roel_service.tracking.verdict import is_possible
+from roel_service.tracking.pursuit import Pursuit
+from roel_service.tracking.search import Search
+from roel_service.tracking.sight import Eyes, glimpse
 from roel_service.tracking.whereabouts import Whereabouts
 
 # To be found, a pose needs events this far around it; to be followed, those of its interval do.
 FINDING_HALF_US = 25_000
 # A lost pose is looked for in so many intervals at once, then, for a while, in every so many, and in
-# every so many after that.
+# every so many after that, as is one that does not convince.
 FINDING_AT_ONCE, EARLY_COUNT, EARLY_STRIDE, FINDING_STRIDE = 2, 16, 4, 10
+# So many searches go on at a time, and so many wait or go on.
+BESIDE_COUNT, MAX_SEARCH_COUNT = 2, 4
 # Its turn is looked at in every so many.
 GLIMPSE_STRIDE = 2
 # Without events for so long, the camera may be anywhere within reach.
@@ -38,10 +40,12 @@ MAX_SILENCE_US = 500_000
 class PoseTracker:
     """Follows a camera: events in, one pose for each interval out.
 
-    Memory holds the map, one interval of events and the last chunk that came.
+    Memory holds the map, one interval of events, the last chunk that came and, during a search, some
+    events of the intervals since it began.
 
     Where several answers explain what is seen about equally well, all are followed, and the best
-    one is told as `UNCERTAIN`. While none convinces, others are looked for beside them.
+    one is told as `UNCERTAIN`. While none convinces, others are looked for beside them. A search
+    takes ten intervals or so, a slice in each, on threads of its own.
 
     Args:
         line_map: where the camera is.
@@ -65,14 +69,17 @@ class PoseTracker:
             pieces=pieces_of(line_map),
         )
         self._rng = np.random.default_rng(seed)
+        self._beside = ThreadPoolExecutor(BESIDE_COUNT, thread_name_prefix="search")
         self._buffer: EventStream | None = None
         self._next_us = 0
-        self._followers: list[Follower] = []
-        # Of a camera that is out of sight, rad/s in its own axes.
+        # Of the camera, rad/s in its own axes.
         self._turn_rate = np.zeros(3)
+        self._pursuit = Pursuit([], self._eyes, config, self._rng)
+        # The first ones go on.
+        self._searches: list[Search] = []
         # Windows since the camera was lost, and since it was known well.
         self._lost_count = self._unsure_count = 0
-        self.guess(guess)
+        self._whereabouts = Whereabouts(guess, self._eyes.pieces.extent_m)
 
     def guess(self, T_world_camera: SE3) -> None:
         """Give up what is known, and look around another pose."""
@@ -123,7 +130,7 @@ class PoseTracker:
     def _reach_us(self) -> int:
         """Time after the next pose of which events are needed."""
         half_us = self._config.interval_us - self._config.interval_us // 2
-        return max(half_us, FINDING_HALF_US) if not self._followers else half_us
+        return max(half_us, FINDING_HALF_US) if self._pursuit.is_over else half_us
 
     def _pose(self, buffer: EventStream) -> TrackedPose:
         """The next interval's pose."""
@@ -134,70 +141,86 @@ class PoseTracker:
         window = window_of(events, self._eyes.ideal_px, span_us, self._config.max_event_count)
         around = _between(buffer, self._next_us - FINDING_HALF_US, self._next_us + self._reach_us())
         self._next_us += self._config.interval_us
-        if self._followers:
-            return self._followed(window, around)
-        return self._found(window, around)
+        slices = self._search_on(window)
+        fit: WindowFit | None = None
+        if self._pursuit.is_over:
+            self._watched(window, around)
+        else:
+            fit = self._followed(window, around)
+        for each in slices:
+            each.result()
+        self._take_up()
+        return _told(window, self._pursuit, fit)
 
-    def _followed(self, window: Window, around: EventStream) -> TrackedPose:
-        for follower in self._followers:
-            follower.follow(window, self._eyes, self._config)
-        best = max(self._followers, key=lambda each: each.explained_count)
-        alive = [each for each in self._followers if each.status is not PoseStatus.LOST]
-        if not alive:
-            self._lose()
-            return _lost(window, best.fit)
-        if not best.fit.evidence.is_still:
-            alive += self._others(window, around, best, is_alone=len(alive) == 1)
-        best, *others = self._followers = rivals(alive)
-        status = PoseStatus.UNCERTAIN if others else best.status
-        if status is PoseStatus.TRACKING:
+    def _search_on(self, window: Window) -> list[Future[None]]:
+        """A slice of the searches that go on, done beside what else this interval needs."""
+        for search in self._searches:
+            search.see(window)
+        return [self._beside.submit(search.go_on) for search in self._searches[:BESIDE_COUNT]]
+
+    def _take_up(self) -> None:
+        """What a search has found, once it is up to date; then the others are idle."""
+        for search in self._searches:
+            if search.found is not None and not search.found.is_over:
+                self._pursuit.join(search.found.followers)
+                self._searches = []
+                return
+        self._searches = [search for search in self._searches if search.found is None]
+
+    def _followed(self, window: Window, around: EventStream) -> WindowFit:
+        """Go on with what is known: the best answer's fit, though it be lost by it."""
+        fit = self._pursuit.follow(window)
+        if self._pursuit.is_over:
+            self._lost_count = self._unsure_count = 0
+            return fit
+        best = self._pursuit.followers[0]
+        is_sure = self._pursuit.status is PoseStatus.TRACKING
+        if is_sure:
             self._whereabouts.relied_on(best.state)
-        self._unsure_count = 0 if status is PoseStatus.TRACKING else self._unsure_count + 1
-        turn_rate = best.state.T_world_camera.rotation.T @ best.state.velocity[:3]
+        place = best.state.T_world_camera
+        turn_rate = place.rotation.T @ best.state.velocity[:3]
         self._whereabouts.turned(turn_rate, window.span_s)
-        return _told(window, status, best.fit)
+        self._unsure_count = 0 if is_sure else self._unsure_count + 1
+        if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1 and not self._searches:
+            self._search(place, turn_rate, window, around, best.before)
+        return fit
 
-    def _others(
-        self, window: Window, around: EventStream, best: Follower, *, is_alone: bool
-    ) -> list[Follower]:
-        """Other answers in place of the best one, as if they had been followed so far."""
-        fits: list[WindowFit] = []
-        if self._unsure_count % FINDING_STRIDE == FINDING_STRIDE - 1:
-            place = best.state.T_world_camera
-            turn_rate = place.rotation.T @ best.state.velocity[:3]
-            sight = look(around, window.t_us, self._eyes, turn_rate)
-            fits = locate(place, sight, window, self._eyes, self._config, self._rng)
-        elif is_alone:
-            fits = challengers(best.state, window, self._eyes, self._config, self._rng)
-        return [best.instead(fit) for fit in fits if is_possible(fit, self._config)]
-
-    def _found(self, window: Window, around: EventStream) -> TrackedPose:
-        """Look for the camera, now and then; see how it turns, all the time."""
+    def _watched(self, window: Window, around: EventStream) -> None:
+        """See how a lost camera turns, and look for it now and then."""
         self._whereabouts.lost(window.t_us)
         attempt, self._lost_count = self._lost_count, self._lost_count + 1
-        if attempt % GLIMPSE_STRIDE == 0 or self._is_searched(attempt):
+        is_searched = _is_searched(attempt) and len(self._searches) < MAX_SEARCH_COUNT
+        if attempt % GLIMPSE_STRIDE == 0 or is_searched:
             self._turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
-        turn_rate = self._turn_rate
-        fits: list[WindowFit] = []
-        if self._is_searched(attempt):
-            sight = look(around, window.t_us, self._eyes, turn_rate)
+        if is_searched:
             place = self._whereabouts.place(window.t_us, attempt, self._rng)
-            fits = locate(place, sight, window, self._eyes, self._config, self._rng)
-        self._whereabouts.turned(turn_rate, window.span_s)
-        possible = [fit for fit in fits if is_possible(fit, self._config)]
-        if not possible:
-            return _lost(window, fits[0] if fits else None)
-        self._followers = rivals([Follower(fit) for fit in possible])
-        return _told(window, PoseStatus.UNCERTAIN, self._followers[0].fit)
+            self._search(place, self._turn_rate, window, around)
+        self._whereabouts.turned(self._turn_rate, window.span_s)
 
-    def _is_searched(self, attempt: int) -> bool:
-        """Whether a lost camera is looked for in this window, which takes as long as many others."""
-        stride = EARLY_STRIDE if attempt < EARLY_COUNT else FINDING_STRIDE
-        return attempt < FINDING_AT_ONCE or attempt % stride == 0
+    def _search(
+        self,
+        place: SE3,
+        turn_rate: FloatArray,
+        window: Window,
+        around: EventStream,
+        before: float = 1.0,
+    ) -> None:
+        """Look around a place from the next interval on."""
+        rng = self._rng.spawn(1)[0]
+        self._searches.append(
+            Search(place, turn_rate, window, around, self._eyes, self._config, rng, before)
+        )
 
     def _lose(self) -> None:
-        self._followers = []
+        self._pursuit = Pursuit([], self._eyes, self._config, self._rng)
+        self._searches = []
         self._lost_count = self._unsure_count = 0
+
+
+def _is_searched(attempt: int) -> bool:
+    """Whether a lost camera is looked for in this window, which takes as long as many others."""
+    stride = EARLY_STRIDE if attempt < EARLY_COUNT else FINDING_STRIDE
+    return attempt < FINDING_AT_ONCE or attempt % stride == 0
 
 
 def _between(events: EventStream, first_us: int, last_us: int) -> EventStream:
@@ -205,24 +228,14 @@ def _between(events: EventStream, first_us: int, last_us: int) -> EventStream:
     return events.part(int(first), int(last))
 
 
-def _told(window: Window, status: PoseStatus, fit: WindowFit) -> TrackedPose:
+def _told(window: Window, pursuit: Pursuit, last_fit: WindowFit | None) -> TrackedPose:
+    fit = last_fit if pursuit.is_over else pursuit.followers[0].fit
+    state = None if pursuit.is_over or fit is None else fit.state
     return TrackedPose(
         t_us=window.t_us,
-        status=status,
-        T_world_camera=fit.state.T_world_camera,
-        covariance=fit.state.covariance[:6, :6],
-        seen_share=fit.evidence.seen_share,
-        sharpness=fit.evidence.sharpness,
-        event_count=window.event_count,
-    )
-
-
-def _lost(window: Window, fit: WindowFit | None) -> TrackedPose:
-    return TrackedPose(
-        t_us=window.t_us,
-        status=PoseStatus.LOST,
-        T_world_camera=None,
-        covariance=None,
+        status=pursuit.status,
+        T_world_camera=None if state is None else state.T_world_camera,
+        covariance=None if state is None else state.covariance[:6, :6],
         seen_share=0.0 if fit is None else fit.evidence.seen_share,
         sharpness=0.0 if fit is None else fit.evidence.sharpness,
         event_count=window.event_count,

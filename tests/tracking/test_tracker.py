@@ -51,23 +51,26 @@ def followed(room):
 def test_poses_come_at_every_interval(followed):
     times = np.array([pose.t_us for pose in followed])
     assert (np.diff(times) == CONFIG.interval_us).all()
-    assert len(times) == 15
+    assert len(times) == 23
 
 
-def test_the_camera_is_found_and_followed(room, followed):
-    assert [pose.status for pose in followed[4:]] == [PoseStatus.TRACKING] * 11
-    turn_deg, shift_m = errors(room, followed[1:]).max(axis=0)
+def test_the_camera_is_looked_for_then_followed(room, followed):
+    statuses = [pose.status for pose in followed]
+    # As many intervals as slices, at the most, and as what was found needs to catch up.
+    found = statuses.index(PoseStatus.TRACKING)
+    assert statuses[:found] == [PoseStatus.LOST] * found
+    assert statuses[found:] == [PoseStatus.TRACKING] * (23 - found)
+    assert 1 < found < 14
+    turn_deg, shift_m = errors(room, followed).max(axis=0)
     assert turn_deg < 0.3
     assert shift_m < 0.01
-
-
-def test_a_pose_that_was_found_just_now_is_uncertain(followed):
-    assert followed[0].status is PoseStatus.UNCERTAIN
 
 
 def test_errors_go_with_the_covariances(room, followed):
     distances = []
     for pose in followed:
+        if pose.T_world_camera is None:
+            continue
         step = pose.T_world_camera.local(room.pose(pose.t_us))
         distances.append(step @ np.linalg.solve(pose.covariance, step))
     # Six numbers each; twice their expectation is allowed for.
@@ -80,9 +83,10 @@ def test_chunks_of_any_size_give_the_same_poses(room, followed):
     again = tracked(room, tracker, room.chunks(7_919))
     assert [pose.status for pose in again] == [pose.status for pose in followed]
     for one, other in zip(again, followed, strict=True):
-        np.testing.assert_array_equal(
-            one.T_world_camera.translation, other.T_world_camera.translation
-        )
+        if one.T_world_camera is not None:
+            np.testing.assert_array_equal(
+                one.T_world_camera.translation, other.T_world_camera.translation
+            )
 
 
 def test_a_camera_at_rest_keeps_its_pose(halfway):
@@ -129,7 +133,7 @@ def moved(events, *, later_us=0, is_turned=False):
 def halfway(room):
     """A tracker that has followed half of the recording, its last pose, and the other half."""
     tracker = PoseTracker(room.line_map, CAMERA, CONFIG, room.pose(25_000))
-    cut = int(np.searchsorted(room.events.t_us, 200_000))
+    cut = int(np.searchsorted(room.events.t_us, 320_000))
     pose = tracker.push(room.events.part(0, cut))[-1]
     assert pose.status is PoseStatus.TRACKING
     return tracker, pose, room.events.part(cut, len(room.events))
@@ -149,7 +153,6 @@ def test_a_hint_leads_to_where_the_camera_is_now(room, halfway):
     upside_down = rotation_from_vector(np.array([0.0, 0.0, np.pi]))
     tracker.guess(SE3(rotation=now.rotation @ upside_down, translation=now.translation))
     after = tracker.push(moved(rest, is_turned=True))
-    assert {pose.status for pose in after[:2]} != {PoseStatus.LOST}
     assert after[-1].T_world_camera.translation == pytest.approx(
         room.pose(after[-1].t_us).translation, abs=0.01
     )
@@ -158,10 +161,10 @@ def test_a_hint_leads_to_where_the_camera_is_now(room, halfway):
 def test_a_silence_makes_the_tracker_look_again(halfway):
     tracker, pose, rest = halfway
     after = tracker.push(moved(rest, later_us=2 * MAX_SILENCE_US))
-    assert after[0].status is not PoseStatus.TRACKING
+    assert after[0].status is PoseStatus.LOST
     assert after[0].t_us > pose.t_us + MAX_SILENCE_US
     # Where it was, not where its motion would have led.
-    assert after[1].status is PoseStatus.UNCERTAIN
+    assert after[-1].status is not PoseStatus.LOST
 
 
 def test_events_that_go_back_in_time_are_refused(room):

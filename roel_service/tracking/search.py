@@ -1,0 +1,94 @@
+"""A search for the camera in one window, a slice of it in each later one.
+
+A search takes as long as ten windows do, or more. It goes on a slice at a time, so that no pose waits
+for all of it, and follows what it finds through the windows that came meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+
+import numpy as np
+
+from roel_service.arrays import FloatArray
+from roel_service.config.stages import TrackConfig
+from roel_service.geometry.se3 import SE3
+from roel_service.scene.events import EventStream
+from roel_service.tracking.fit import Window
+from roel_service.tracking.follower import Follower
+from roel_service.tracking.locate import locating
+from roel_service.tracking.pursuit import Pursuit
+from roel_service.tracking.sight import Eyes, look
+from roel_service.tracking.verdict import is_possible
+
+# What it finds goes through windows until so many fits are done, in a slice.
+SLICE_FIT_COUNT = 5
+
+
+class Search:
+    """What is found around a place in one window, followed until it is up to date.
+
+    Args:
+        place: rough `T_world_camera`.
+        turn_rate: (3,) rad/s in the camera's own axes.
+        window: the one that is searched.
+        around: events around its middle.
+        eyes: with which the camera is looked for.
+        config: parameters.
+        rng: draws what is tried.
+        before: what an answer explains counts so many times, in place of windows before it.
+
+    Attributes:
+        found: what is left of the answers in the last window; None while the search goes on.
+    """
+
+    def __init__(
+        self,
+        place: SE3,
+        turn_rate: FloatArray,
+        window: Window,
+        around: EventStream,
+        eyes: Eyes,
+        config: TrackConfig,
+        rng: np.random.Generator,
+        before: float = 1.0,
+    ) -> None:
+        self.found: Pursuit | None = None
+        self._waiting: deque[Window] = deque()
+        self._eyes, self._config, self._rng = eyes, config, rng
+        self._slices = self._searching(place, turn_rate, window, around, before)
+
+    def see(self, window: Window) -> None:
+        """Another window has come."""
+        self._waiting.append(window)
+
+    def go_on(self) -> None:
+        """Do the next slice."""
+        next(self._slices, None)
+
+    def _searching(
+        self,
+        place: SE3,
+        turn_rate: FloatArray,
+        window: Window,
+        around: EventStream,
+        before: float,
+    ) -> Generator[None, None, None]:
+        eyes, config, rng = self._eyes, self._config, self._rng
+        sight = look(around, window.t_us, eyes, turn_rate)
+        yield
+        fits = yield from locating(place, sight, window, eyes, config, rng)
+        answers = [Follower(fit, before) for fit in fits if is_possible(fit, config)]
+        pursuit = Pursuit(answers, eyes, config, rng)
+        while self._waiting and not pursuit.is_over:
+            yield
+            self._catch_up(pursuit)
+        self.found = pursuit
+
+    def _catch_up(self, pursuit: Pursuit) -> None:
+        """Follow through some of the windows that wait: always more than come meanwhile."""
+        fit_count = 0
+        while self._waiting and not pursuit.is_over and fit_count < SLICE_FIT_COUNT:
+            fit_count += pursuit.cost
+            pursuit.follow(self._waiting.popleft())
