@@ -208,14 +208,25 @@ class Client:
         config: Config,
         map_version: str | None = None,
         progress: ProgressCallback = ignore,
+        *,
+        estimate_time_offset: bool = False,
+        estimate_intrinsics: bool = False,
     ) -> tuple[Trajectory, maps_pb2.RefinePosesResponse]:
         """Let the server refine poses as `refine_poses` would in process; no recording stays there.
 
         Args:
             map_version: a map that stays as it is; None refines lines and poses together.
+            estimate_time_offset: the clock of the poses may run beside that of the events.
+            estimate_intrinsics: the focal length may be off; takes some six times as long.
         """
         with self.hosted_recording(events, trajectory, camera, progress) as stream:
-            operation = self.refine_poses(stream, config, map_version=map_version)
+            operation = self.refine_poses(
+                stream,
+                config,
+                map_version=map_version,
+                estimate_time_offset=estimate_time_offset,
+                estimate_intrinsics=estimate_intrinsics,
+            )
             answer = operation.wait(progress)
             return self.download_poses(answer.trajectory), answer
 
@@ -345,18 +356,24 @@ class Client:
         *,
         map_version: str | None = None,
         target_map: str | None = None,
+        estimate_time_offset: bool = False,
+        estimate_intrinsics: bool = False,
     ) -> Operation:
         """Begin to refine the poses of a recording.
 
         Args:
             map_version: a map that stays as it is; None refines lines and poses together.
             target_map: a map that gets a version of the lines seen from the refined poses.
+            estimate_time_offset: the clock of the poses may run beside that of the events.
+            estimate_intrinsics: the focal length may be off; takes some six times as long.
         """
         request = maps_pb2.RefinePosesRequest(
             event_stream=stream,
             map_version=map_version,
             target_map=target_map,
             config=config_to_proto(config),
+            estimate_time_offset=estimate_time_offset,
+            estimate_intrinsics=estimate_intrinsics,
         )
         begun = self._connection.call(self._maps.RefinePoses, request)
         return self.operation(begun.name)

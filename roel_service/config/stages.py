@@ -408,6 +408,12 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
     pose_drift_m: float = parameter(0.005, POSITIVE)
     pose_drift_s: float = parameter(1.5, POSITIVE)
 
+    def require_more_than_poses(self) -> None:
+        """Raise `ConfigError` unless a time offset or intrinsics may be estimated beside the poses."""
+        if self.pose_method == "batch":
+            expected = "smooth, where a time offset or intrinsics are estimated"
+            raise ConfigError("refine.pose_method", expected, self.pose_method)
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrimConfig(Stage, table="trim"):

@@ -98,6 +98,8 @@ def refinement_preparation(store: Store) -> Prepare:
             ),
             fixed_map=fixed and MapFile(name=request.map_version, sha256=fixed[0], path=fixed[1]),
             makes_version=bool(operation.map_id),
+            estimate_time_offset=request.estimate_time_offset,
+            estimate_intrinsics=request.estimate_intrinsics,
         )
         return Prepared("roel_service.jobs.refinement:run_refinement", parameters)
 

@@ -18,9 +18,12 @@ class RefineParameters:
         trajectory: takes the place of the recording's poses.
         fixed_map: holds the poses; None: lines and poses are refined together.
         makes_version: whether the lines are wanted too.
+        estimate_time_offset, estimate_intrinsics: what may be off beside the poses.
     """
 
     recording: BuildParameters
     trajectory: Trajectory | None
     fixed_map: MapFile | None
     makes_version: bool
+    estimate_time_offset: bool
+    estimate_intrinsics: bool

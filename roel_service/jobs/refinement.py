@@ -14,6 +14,7 @@ from roel_service.jobs.build import build_map, built_version
 from roel_service.jobs.refine_inputs import RefineParameters
 from roel_service.jobs.task import Tell
 from roel_service.mapping import refine_poses as poses
+from roel_service.mapping.focal_search import with_focal
 from roel_service.mapping.pipeline import POSES_SHARE
 from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
@@ -66,6 +67,8 @@ def run_refinement(parameters: RefineParameters, tell: Tell) -> RefinedPoses:
         camera,
         config,
         line_map=None if fixed_map is None else fixed_map.line_map(),
+        estimate_time_offset=parameters.estimate_time_offset,
+        estimate_intrinsics=parameters.estimate_intrinsics,
         progress=part_of(tell, 0.0, POSES_SHARE) if parameters.makes_version else tell,
     )
     version = None
@@ -74,6 +77,8 @@ def run_refinement(parameters: RefineParameters, tell: Tell) -> RefinedPoses:
         fixed = dataclasses.replace(
             config, refine=dataclasses.replace(config.refine, free_poses=False)
         )
+        if report["focal_is_applied"]:
+            camera = with_focal(camera, report["focal_scale"])
         rest = part_of(tell, POSES_SHARE, 1.0)
         built = build_map(events, trajectory, camera, fixed, rest)
         version = built_version(built, with_poses=True)

@@ -16,7 +16,6 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import Config, RefineConfig, RefineRoundsConfig
-from roel_service.errors import ConfigError
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_poses, as_large_as
 from roel_service.geometry.se3 import SE3
@@ -149,8 +148,7 @@ def refine_poses(
     """
     if config.refine.pose_method == "batch" and line_map is None:
         if estimate_time_offset or estimate_intrinsics:
-            expected = "smooth, where a time offset or intrinsics are estimated"
-            raise ConfigError("refine.pose_method", expected, "batch")
+            config.refine.require_more_than_poses()
         return refine_poses_at_once(events, trajectory, camera, config, progress)
     seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
     focal = None

@@ -299,7 +299,15 @@ def _validated(map_id: str, version: int, event_stream: str) -> operations_pb2.O
 
 def _refinement(request: maps_pb2.RefinePosesRequest) -> maps_pb2.RefinePosesRequest:
     """What a refinement needs to know beside rows; raises `ConfigError`, `TrajectoryError`."""
-    parameters = maps_pb2.RefinePosesRequest(config=config_to_proto(_requested_config(request)))
+    config = _requested_config(request)
+    estimates_more = request.estimate_time_offset or request.estimate_intrinsics
+    if estimates_more and not request.map_version:
+        config.refine.require_more_than_poses()
+    parameters = maps_pb2.RefinePosesRequest(
+        config=config_to_proto(config),
+        estimate_time_offset=request.estimate_time_offset,
+        estimate_intrinsics=request.estimate_intrinsics,
+    )
     if request.HasField("trajectory"):
         trajectory_from_proto(request.trajectory)
         parameters.trajectory.CopyFrom(request.trajectory)

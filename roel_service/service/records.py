@@ -161,9 +161,6 @@ def refinement_answer(
     result = json.loads(record.result)
     trajectory = types_pb2.BlobRef(sha256=result.pop("sha256"), size_bytes=result.pop("size_bytes"))
     iteration_count = result.pop("iterations")
-    # A server is not asked for the focal length; records of before it was told have none.
-    for told in ("focal_scale", "focal_scale_sigma", "focal_is_applied"):
-        result.pop(told, None)
     answer = maps_pb2.RefinePosesResponse(
         trajectory=trajectory, iteration_count=iteration_count, **result
     )

@@ -107,14 +107,6 @@ def test_poses_to_write_need_poses_to_refine(folder: Path) -> None:
     assert not (folder / "none.txt").exists()
 
 
-@pytest.mark.parametrize("option", ["--estimate-time-offset", "--estimate-intrinsics"])
-def test_a_server_estimates_neither_clocks_nor_cameras(folder: Path, option: str) -> None:
-    given = ("--out", "none.txt", option, "--server", "localhost:1")
-    done = roel(folder, "refine-poses", *INPUTS, *given)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith(f"roel: error: {option}: expected no --server")
-
-
 def test_poses_without_lines_have_no_answer(folder: Path) -> None:
     (folder / "blind.toml").write_text("[detect]\nmin_length_px = 500.0\n")
     done = roel(folder, "refine-poses", *INPUTS, "--out", "none.txt", "--config", "blind.toml")

@@ -10,7 +10,7 @@ import pytest
 
 from roel_client import Client
 from roel_service.config.presets import preset
-from roel_service.errors import InputError, NotFoundError, StateError
+from roel_service.errors import ConfigError, InputError, NotFoundError, StateError
 from roel_service.jobs.build import build_map
 from roel_service.jobs.refinement import refine_poses
 from roel_service.scene.lines import LineMap
@@ -75,6 +75,27 @@ def test_server_and_process_refine_poses_alike_and_make_a_version_of_the_lines(a
         assert answer.map_version.trajectory == answer.trajectory
         built = build_map(given[0], trajectory, CAMERA, CONFIG)
         assert client.download_map(answer.map_version.name) == built.rlm_bytes
+
+
+@pytest.mark.parametrize(
+    "estimate",
+    ["estimate_time_offset", pytest.param("estimate_intrinsics", marks=pytest.mark.slow)],
+)
+def test_server_and_process_estimate_alike_what_is_off_beside_the_poses(address, world, estimate):
+    late = dataclasses.replace(noisy_trajectory(), t_us=noisy_trajectory().t_us + 30_000)
+    line_map = decode_map(world.read_bytes()).line_map
+    given = (event_stream(), late, CAMERA, CONFIG)
+    trajectory, report = refine_poses(*given, line_map=line_map, **{estimate: True})
+    with Client(address) as client, client.hosted_map(world) as fixed:
+        poses, answer = client.refine_recording(*given, fixed, **{estimate: True})
+        with pytest.raises(ConfigError, match=r"refine\.pose_method"):
+            client.refine_recording(*given[:3], preset("paper"), **{estimate: True})
+    assert_equal_poses(poses, trajectory)
+    assert answer.time_offset_us == report["time_offset_us"] < -15_000
+    assert answer.HasField("focal_scale") == (estimate == "estimate_intrinsics")
+    for name in ("focal_scale", "focal_scale_sigma"):
+        assert (getattr(answer, name) or None) == report[name]
+    assert answer.focal_is_applied == report["focal_is_applied"]
 
 
 def test_server_and_process_find_equal_poses_of_a_map(address):

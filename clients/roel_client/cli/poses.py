@@ -13,7 +13,7 @@ from roel_client.cli.configuration import (
 )
 from roel_client.cli.maps import add_recording_options
 from roel_client.cli.output import print_result, progress_bar
-from roel_client.cli.parser import Command, Subparsers, UsageError, command, suffixed
+from roel_client.cli.parser import Command, Subparsers, command, suffixed
 from roel_client.cli.process import interruptible
 from roel_client.cli.servers import add_server_options, server_options
 from roel_client.cli.staging import Staged
@@ -57,9 +57,6 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
     """Refine the poses of a recording, and write them at their own times."""
     from roel_client.local import poses, recordings
 
-    for name in ("--estimate-time-offset", "--estimate-intrinsics"):
-        if getattr(options, name[2:].replace("-", "_")) and options.server is not None:
-            raise UsageError(name, "no --server beside it", options.server)
     config = effective_config(options, seed_table(options))
     recording = recordings.open_recording(
         options.events, options.poses, options.camera, options.sensor_size
@@ -83,7 +80,9 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
                     options.map,
                     config,
                     staged["out"],
-                    progress,
+                    estimate_time_offset=options.estimate_time_offset,
+                    estimate_intrinsics=options.estimate_intrinsics,
+                    progress=progress,
                     server=options.server,
                     options=server_options(options),
                 )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from roel_service.config.stages import Config
     from roel_service.progress import ProgressCallback
     from roel_service.scene.trajectory import Trajectory
+    from roel_service.v1 import maps_pb2
 
 
 def refine_poses(
@@ -60,8 +61,10 @@ def refine_poses_remotely(
     map_name: str | None,
     config: Config,
     out: Path,
-    progress: ProgressCallback,
     *,
+    estimate_time_offset: bool,
+    estimate_intrinsics: bool,
+    progress: ProgressCallback,
     server: str,
     options: dict[str, Any],
 ) -> tuple[dict[str, Any], Trajectory]:
@@ -82,10 +85,16 @@ def refine_poses_remotely(
         if map_name is not None:
             version = resources.enter_context(hosted(client, map_name))
         trajectory, answer = client.refine_recording(
-            recording.events, recording.trajectory, recording.camera, config, version, progress
+            recording.events,
+            recording.trajectory,
+            recording.camera,
+            config,
+            version,
+            progress,
+            estimate_time_offset=estimate_time_offset,
+            estimate_intrinsics=estimate_intrinsics,
         )
     write_poses(trajectory, out)
-    has_sigma = answer.HasField("time_offset_sigma_us")
     result = {
         "pose_count": answer.pose_count,
         "line_count": answer.line_count,
@@ -96,14 +105,18 @@ def refine_poses_remotely(
         "mean_shift_m": answer.mean_shift_m,
         "mean_turn_deg": answer.mean_turn_deg,
         "time_offset_us": answer.time_offset_us,
-        "time_offset_sigma_us": answer.time_offset_sigma_us if has_sigma else None,
-        "focal_scale": None,
-        "focal_scale_sigma": None,
-        "focal_is_applied": False,
+        "time_offset_sigma_us": _told(answer, "time_offset_sigma_us"),
+        "focal_scale": _told(answer, "focal_scale"),
+        "focal_scale_sigma": _told(answer, "focal_scale_sigma"),
+        "focal_is_applied": answer.focal_is_applied,
         "problems": list(answer.problems),
         "seconds": time.perf_counter() - started_s,
     }
     return result, trajectory
+
+
+def _told(answer: maps_pb2.RefinePosesResponse, name: str) -> float | None:
+    return getattr(answer, name) if answer.HasField(name) else None
 
 
 def draw_poses(
