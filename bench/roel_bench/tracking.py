@@ -33,6 +33,7 @@ from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
 from roel_service.scene.trajectory import Trajectory
 from roel_service.tracking.tracker import FINDING_HALF_US, PoseTracker
+from roel_service.tracking.warm import warm_up
 
 FORMAT = "roel tracking benchmark 1"
 WRONG_M, WRONG_DEG = 0.05, 2.0
@@ -70,6 +71,9 @@ class Trial:
         nees: mean of the squared errors against their covariances; 6 where these are honest.
         found_s: time until a pose was TRACKING and near the truth; after the cut for `silence` and `jump`.
         processor_ms: processor time of a pose, in the mean.
+        following_ms, searching_ms: time by the clock of a pose that is told, and of one that is LOST:
+            median, 95 % and the largest; null without any. Events that complete no pose count for the
+            next one.
     """
 
     walk: str
@@ -89,6 +93,8 @@ class Trial:
     nees: float | None
     found_s: float | None
     processor_ms: float
+    following_ms: tuple[float, float, float] | None
+    searching_ms: tuple[float, float, float] | None
 
 
 def open_walk(folder: Path, map_path: Path) -> Walk:
@@ -173,11 +179,18 @@ def trial(
     guess = farthest_guess(first, config, np.random.default_rng(seed))
     tracker = PoseTracker(line_map, walk.camera, config, guess, seed)
     told: list[tuple[TrackedPose, int]] = []
-    busy_s = 0.0
+    busy_s = pending_s = 0.0
+    following_s: list[float] = []
+    searching_s: list[float] = []
     for events, behind_us in pieces(walk.events, *span_us, cut_us, clock_stops=kind == "jump"):
-        began_s = time.process_time()
+        began_s, at_s = time.process_time(), time.perf_counter()
         poses = tracker.push(events)
         busy_s += time.process_time() - began_s
+        pending_s += time.perf_counter() - at_s
+        for pose in poses:
+            is_lost = pose.status is PoseStatus.LOST
+            (searching_s if is_lost else following_s).append(pending_s / len(poses))
+        pending_s = 0.0 if poses else pending_s
         # A pose whose events are of both sides of the cut belongs to before it.
         told += [
             (
@@ -208,7 +221,17 @@ def trial(
         nees=round(float(np.mean(nees)), 2) if len(nees) else None,
         found_s=round((int(found[0]) - since_us) * 1e-6, 3) if len(found) else None,
         processor_ms=round(1e3 * busy_s / max(1, len(told)), 2),
+        following_ms=_spread_ms(following_s),
+        searching_ms=_spread_ms(searching_s),
     )
+
+
+def _spread_ms(seconds: Sequence[float]) -> tuple[float, float, float] | None:
+    """Median, 95 % and largest."""
+    if not seconds:
+        return None
+    median, p95, worst = (round(1e3 * float(np.quantile(seconds, q)), 1) for q in (0.5, 0.95, 1.0))
+    return median, p95, worst
 
 
 def _errors(
@@ -267,6 +290,7 @@ def as_table(rows: Sequence[Trial]) -> str:
     """The trials as Markdown."""
     header = ["walk", "map", "kind", "poses", "TRACKING", "LOST", "wrong", "median deg, mm"]
     header += ["p95 deg, mm", "worst deg, mm", "NEES", "found s", "processor ms"]
+    header += ["following ms", "searching ms"]
     return table(header, [_cells(row) for row in rows])
 
 
@@ -280,7 +304,9 @@ def _cells(row: Trial) -> list[str]:
     counts = [row.pose_count, row.tracking_count, row.lost_count, row.wrong_count]
     last = [row.nees, row.found_s, row.processor_ms]
     told = ["" if value is None else f"{value:g}" for value in last]
-    return [row.walk, row.map, row.kind, *map(str, counts), *errors, *told]
+    spreads = (row.following_ms, row.searching_ms)
+    times = ["" if each is None else ", ".join(f"{ms:.0f}" for ms in each) for each in spreads]
+    return [row.walk, row.map, row.kind, *map(str, counts), *errors, *told, *times]
 
 
 def main() -> None:
@@ -295,6 +321,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.json")
     options = parser.parse_args()
+    warm_up()
     others = [(Path(name).stem, read_exported_map(Path(name))) for name in options.elsewhere]
     rows: list[Trial] = []
     for folder, map_name in options.walk:

@@ -6,6 +6,7 @@ from roel_service.errors import StateError
 from roel_service.jobs.questions import NextChunk, NextGuess, TrackingBegins
 from roel_service.jobs.task import Tell
 from roel_service.tracking.tracker import PoseTracker
+from roel_service.tracking.warm import warm_up
 from roel_service.wire.chunks import decode_chunk
 from roel_service.wire.tracking import tracked_pose_to_proto
 
@@ -40,6 +41,7 @@ class _Tracking:
     """One camera in one map."""
 
     def __init__(self, begins: TrackingBegins) -> None:
+        warm_up()
         self.tracker = PoseTracker(
             begins.map.line_map(), begins.camera, begins.config, begins.T_world_camera
         )

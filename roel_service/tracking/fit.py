@@ -72,7 +72,8 @@ class Window:
     def thinned(self, most: int) -> Window:
         """The window with `most` of its events, or a few more."""
         chosen = slice(0, None, max(1, len(self.slot) // most))
-        return replace(self, xy_px=self.xy_px[chosen], slot=self.slot[chosen])
+        # Side by side in memory, as loops expect them.
+        return replace(self, xy_px=self.xy_px[chosen].copy(), slot=self.slot[chosen].copy())
 
 
 @dataclass(frozen=True, kw_only=True)

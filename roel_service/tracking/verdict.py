@@ -13,6 +13,9 @@ from roel_service.tracking.fit import WindowFit
 MIN_SEEN_COUNT = 6
 # Of what convinces, this share or less contradicts.
 CONTRADICTING_SHARE = 0.3
+# A pose that was found is doubted, not contradicted, by windows that have this share of what it needs
+# to be found: where others hide some lines, a right pose is not far above that.
+DOUBTING_SHARE = 0.75
 # So many windows in a row must convince before a pose is relied on. It is given up when so many
 # contradict, or when it has not convinced for so many.
 CONVINCED_COUNT, CONTRADICTED_COUNT, PATIENCE_COUNT = 4, 3, 20
@@ -27,10 +30,19 @@ def convinces(fit: WindowFit, config: TrackConfig) -> bool:
 
 def is_possible(fit: WindowFit, config: TrackConfig) -> bool:
     """Whether events lie on the lines that must have some."""
+    return _lie_on_lines(fit, config.min_seen_share, config)
+
+
+def _contradicts(fit: WindowFit, config: TrackConfig) -> bool:
+    """Whether many lines that must have events have none."""
+    return not _lie_on_lines(fit, DOUBTING_SHARE * config.min_seen_share, config)
+
+
+def _lie_on_lines(fit: WindowFit, min_seen_share: float, config: TrackConfig) -> bool:
     evidence = fit.evidence
     return (
         evidence.seen_count >= MIN_SEEN_COUNT
-        and evidence.seen_share >= config.min_seen_share
+        and evidence.seen_share >= min_seen_share
         and evidence.sharpness >= CONTRADICTING_SHARE * config.min_sharpness
     )
 
@@ -73,7 +85,7 @@ class Verdict:
             return
         self._convinced_count = 0
         self._unconvinced_count += 1
-        self._contradicted_count = 0 if is_possible(fit, config) else self._contradicted_count + 1
+        self._contradicted_count = self._contradicted_count + 1 if _contradicts(fit, config) else 0
 
 
 def _is_known(covariance: FloatArray, config: TrackConfig) -> bool:

@@ -66,9 +66,16 @@ def test_one_window_that_does_not_convince_costs_the_trust(convinced):
 
 
 def test_windows_that_contradict_lose_the_pose(convinced):
-    poor = fit(share=0.8 * CONFIG.min_seen_share)
+    poor = fit(share=0.7 * CONFIG.min_seen_share)
     expected = [PoseStatus.UNCERTAIN] * (CONTRADICTED_COUNT - 1) + [PoseStatus.LOST]
     assert statuses(convinced, *[poor] * CONTRADICTED_COUNT) == expected
+
+
+def test_windows_that_lack_little_do_not_lose_the_pose(convinced):
+    hidden = fit(share=0.9 * CONFIG.min_seen_share)
+    again = [*[hidden] * 2 * CONTRADICTED_COUNT, *[fit()] * CONVINCED_COUNT]
+    found = statuses(convinced, *again)
+    assert found == [PoseStatus.UNCERTAIN] * (len(again) - 1) + [PoseStatus.TRACKING]
 
 
 def test_one_window_with_hardly_anything_loses_it_at_once(convinced):
