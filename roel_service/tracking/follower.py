@@ -64,6 +64,11 @@ class Follower:
         """Another answer for the last window, as if it had been followed so far."""
         return Follower(fit, self.before)
 
+    def begin_anew(self) -> None:
+        """Take nothing that was said so far for a reason to rely on it."""
+        self.status = PoseStatus.UNCERTAIN
+        self._verdict = Verdict()
+
     def follow(self, window: Window, eyes: Eyes, config: TrackConfig) -> None:
         """Go on to the next window."""
         after_s = (window.t_us - self.state.t_us) * 1e-6

@@ -15,9 +15,6 @@ from roel_service.tracking.locate import is_same_pose
 from roel_service.tracking.sight import Eyes
 from roel_service.tracking.verdict import is_possible
 
-# A challenge takes about as long as this many followers.
-CHALLENGE_COST = 1
-
 
 class Pursuit:
     """Followers of one camera, and what challenges the last of them.
@@ -55,20 +52,19 @@ class Pursuit:
         best, *others = self.followers
         return PoseStatus.UNCERTAIN if others else best.status
 
-    @property
-    def cost(self) -> int:
-        """How many fits, about, the next window takes."""
-        count = len(self.followers)
-        return count + CHALLENGE_COST if count == 1 else count
-
     def follow(self, window: Window) -> WindowFit:
         """Go on to the next window, and tell what it says of the best answer, though it be lost."""
+        best = self.hurry(window)
+        if len(self.followers) == 1 and not self.followers[0].fit.evidence.is_still:
+            self.join(self._challengers(self.followers[0], window))
+        return best
+
+    def hurry(self, window: Window) -> WindowFit:
+        """Do so without a challenge."""
         for follower in self.followers:
             follower.follow(window, self._eyes, self._config)
         best = max(self.followers, key=lambda each: each.explained_count)
         alive = [each for each in self.followers if each.status is not PoseStatus.LOST]
-        if len(alive) == 1 and not alive[0].fit.evidence.is_still:
-            alive += self._challengers(alive[0], window)
         self.followers = rivals(alive)
         return best.fit
 

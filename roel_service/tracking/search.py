@@ -22,8 +22,9 @@ from roel_service.tracking.pursuit import Pursuit
 from roel_service.tracking.sight import Eyes, look
 from roel_service.tracking.verdict import is_possible
 
-# What it finds goes through windows until so many fits are done, in a slice.
-SLICE_FIT_COUNT = 5
+# What it finds goes through windows until so many fits are done, in a slice; so many events of each are
+# enough.
+SLICE_FIT_COUNT, EVENT_COUNT = 5, 4_000
 
 
 class Search:
@@ -61,7 +62,7 @@ class Search:
 
     def see(self, window: Window) -> None:
         """Another window has come."""
-        self._waiting.append(window)
+        self._waiting.append(window.thinned(EVENT_COUNT))
 
     def go_on(self) -> None:
         """Do the next slice."""
@@ -84,11 +85,13 @@ class Search:
         while self._waiting and not pursuit.is_over:
             yield
             self._catch_up(pursuit)
+        for follower in pursuit.followers:
+            follower.begin_anew()
         self.found = pursuit
 
     def _catch_up(self, pursuit: Pursuit) -> None:
         """Follow through some of the windows that wait: always more than come meanwhile."""
         fit_count = 0
         while self._waiting and not pursuit.is_over and fit_count < SLICE_FIT_COUNT:
-            fit_count += pursuit.cost
-            pursuit.follow(self._waiting.popleft())
+            fit_count += len(pursuit.followers)
+            pursuit.hurry(self._waiting.popleft())

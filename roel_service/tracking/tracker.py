@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -29,8 +29,8 @@ FINDING_HALF_US = 25_000
 # A lost pose is looked for in so many intervals at once, then, for a while, in every so many, and in
 # every so many after that, as is one that does not convince.
 FINDING_AT_ONCE, EARLY_COUNT, EARLY_STRIDE, FINDING_STRIDE = 2, 16, 4, 10
-# So many searches go on at a time, and so many wait or go on.
-BESIDE_COUNT, MAX_SEARCH_COUNT = 2, 4
+# So many searches wait for each other.
+MAX_SEARCH_COUNT = 4
 # Its turn is looked at in every so many.
 GLIMPSE_STRIDE = 2
 # Without events for so long, the camera may be anywhere within reach.
@@ -45,7 +45,7 @@ class PoseTracker:
 
     Where several answers explain what is seen about equally well, all are followed, and the best
     one is told as `UNCERTAIN`. While none convinces, others are looked for beside them. A search
-    takes ten intervals or so, a slice in each, on threads of its own.
+    takes ten intervals or so, a slice in each, on a thread of its own.
 
     Args:
         line_map: where the camera is.
@@ -69,13 +69,13 @@ class PoseTracker:
             pieces=pieces_of(line_map),
         )
         self._rng = np.random.default_rng(seed)
-        self._beside = ThreadPoolExecutor(BESIDE_COUNT, thread_name_prefix="search")
+        self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="search")
         self._buffer: EventStream | None = None
         self._next_us = 0
         # Of the camera, rad/s in its own axes.
         self._turn_rate = np.zeros(3)
         self._pursuit = Pursuit([], self._eyes, config, self._rng)
-        # The first ones go on.
+        # The first one goes on.
         self._searches: list[Search] = []
         # Windows since the camera was lost, and since it was known well.
         self._lost_count = self._unsure_count = 0
@@ -141,7 +141,9 @@ class PoseTracker:
         window = window_of(events, self._eyes.ideal_px, span_us, self._config.max_event_count)
         around = _between(buffer, self._next_us - FINDING_HALF_US, self._next_us + self._reach_us())
         self._next_us += self._config.interval_us
-        slices = self._search_on(window)
+        for search in self._searches:
+            search.see(window)
+        slices = [self._beside.submit(search.go_on) for search in self._searches[:1]]
         fit: WindowFit | None = None
         if self._pursuit.is_over:
             self._watched(window, around)
@@ -151,12 +153,6 @@ class PoseTracker:
             each.result()
         self._take_up()
         return _told(window, self._pursuit, fit)
-
-    def _search_on(self, window: Window) -> list[Future[None]]:
-        """A slice of the searches that go on, done beside what else this interval needs."""
-        for search in self._searches:
-            search.see(window)
-        return [self._beside.submit(search.go_on) for search in self._searches[:BESIDE_COUNT]]
 
     def _take_up(self) -> None:
         """What a search has found, once it is up to date; then the others are idle."""

@@ -16,6 +16,9 @@ CONTRADICTING_SHARE = 0.3
 # A pose that was found is doubted, not contradicted, by windows that have this share of what it needs
 # to be found: where others hide some lines, a right pose is not far above that.
 DOUBTING_SHARE = 0.75
+# Of a pose that is known so many times worse than what may be relied on, nothing that convinces counts:
+# what it narrows down to is an answer like one that was found just now.
+WIDE = 3.0
 # So many windows in a row must convince before a pose is relied on. It is given up when so many
 # contradict, or when it has not convinced for so many.
 CONVINCED_COUNT, CONTRADICTED_COUNT, PATIENCE_COUNT = 4, 3, 20
@@ -62,6 +65,8 @@ class Verdict:
             cautious: (12, 12) covariance of the state if no edge is relied on alone.
         """
         self._count(fit, config)
+        if not _is_known(cautious, config, WIDE):
+            self._convinced_count = 0
         is_elsewhere = (
             self._contradicted_count > 0
             and fit.evidence.seen_share < CONTRADICTING_SHARE * config.min_seen_share
@@ -88,7 +93,8 @@ class Verdict:
         self._contradicted_count = self._contradicted_count + 1 if _contradicts(fit, config) else 0
 
 
-def _is_known(covariance: FloatArray, config: TrackConfig) -> bool:
+def _is_known(covariance: FloatArray, config: TrackConfig, times: float = 1.0) -> bool:
     turn = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     shift = np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]
-    return bool(turn <= np.deg2rad(config.max_sigma_deg) ** 2 and shift <= config.max_sigma_m**2)
+    max_turn, max_shift = times * np.deg2rad(config.max_sigma_deg), times * config.max_sigma_m
+    return bool(turn <= max_turn**2 and shift <= max_shift**2)

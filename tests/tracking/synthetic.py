@@ -63,7 +63,7 @@ def motion(t_us):
 
 
 @functools.cache
-def recording(seed=0, seconds=0.6):
+def recording(seed=0, seconds=0.9):
     segments = walls(seed)
     t_us = np.arange(0, round(seconds * 1e6) + STEP_US, STEP_US)
     poses = motion(t_us)

@@ -12,6 +12,7 @@ from roel_service.tracking.verdict import (
     CONTRADICTED_COUNT,
     CONVINCED_COUNT,
     PATIENCE_COUNT,
+    WIDE,
     Verdict,
 )
 
@@ -100,6 +101,12 @@ def test_a_pose_that_few_lines_hold_is_uncertain(convinced):
 def test_a_pose_that_one_edge_holds_is_uncertain(convinced):
     without_it = (2.0 * CONFIG.max_sigma_m) ** 2 * np.eye(12)
     assert convinced.of(fit(), without_it, CONFIG) is PoseStatus.UNCERTAIN
+
+
+def test_a_pose_that_was_hardly_known_has_to_convince_again(convinced):
+    wide = fit(sigma_m=2.0 * WIDE * CONFIG.max_sigma_m)
+    expected = [*[PoseStatus.UNCERTAIN] * CONVINCED_COUNT, PoseStatus.TRACKING]
+    assert statuses(convinced, wide, *[fit()] * CONVINCED_COUNT) == expected
 
 
 def test_a_motion_that_does_not_go_on_costs_the_trust(convinced):
