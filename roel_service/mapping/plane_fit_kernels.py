@@ -157,15 +157,16 @@ def gather(
             if abs(mx * local.dy - my * local.dx) > margin:
                 continue
             cell = (side * grid.rows + row) * grid.columns + column
-            for k in range(grid.start[cell], grid.start[cell + 1]):
+            first, last = grid.start[cell], grid.start[cell + 1]
+            while count + last - first > len(near):
+                near = np.concatenate((near, np.empty_like(near)))
+            for k in range(first, last):
                 ex, ey = grid.xy_px[k, 0] - local.qx, grid.xy_px[k, 1] - local.qy
                 u = ex * local.dx + ey * local.dy
                 s = ey * local.dx - ex * local.dy
-                if abs(s) < max_s and abs(u) < max_u:
-                    if count == len(near):
-                        near = np.concatenate((near, np.empty_like(near)))
-                    near[count] = k
-                    count += 1
+                # Written in any case: nothing foretells which events are in, and a wrong guess costs more.
+                near[count] = k
+                count += (abs(s) < max_s) & (abs(u) < max_u)
     return near, count
 
 
@@ -195,24 +196,24 @@ def vote_speed(
     position, rate = np.empty(len(u) // stride + 1), np.empty(len(u) // stride + 1)
     chosen = 0
     for k in range(0, len(u), stride):
-        if abs(u[k]) <= half + 2.0:
-            position[chosen] = (s[k] + settings.candidate_distance_px) / VOTE_BIN_PX
-            rate[chosen] = tau[k] / VOTE_BIN_PX
-            chosen += 1
-    position, rate = position[:chosen], rate[:chosen]
-    counts = np.empty(int(2.0 * settings.candidate_distance_px / VOTE_BIN_PX), np.int64)
+        position[chosen] = (s[k] + settings.candidate_distance_px) / VOTE_BIN_PX
+        rate[chosen] = tau[k] / VOTE_BIN_PX
+        chosen += abs(u[k]) <= half + 2.0
+    position, rate, place = position[:chosen], rate[:chosen], np.empty(chosen, np.int32)
+    # One bin more at either end, for what lies outside.
+    counts = np.empty(int(2.0 * settings.candidate_distance_px / VOTE_BIN_PX) + 2, np.int32)
     step = 2.0 * settings.max_speed_px_per_ms / (settings.speed_count - 1)
     best, best_alpha, best_index = -1.0, 0.0, 0
     for index in range(0, settings.speed_count, 2):
         gamma = index * step - settings.max_speed_px_per_ms
-        score, alpha = strongest_bins(position, rate, gamma, settings, counts)
+        score, alpha = strongest_bins(position, rate, gamma, settings, place, counts)
         if score > best:
             best, best_alpha, best_index = score, alpha, index
     coarse = best_index
     for index in (coarse - 1, coarse + 1):
         if 0 <= index < settings.speed_count:
             gamma = index * step - settings.max_speed_px_per_ms
-            score, alpha = strongest_bins(position, rate, gamma, settings, counts)
+            score, alpha = strongest_bins(position, rate, gamma, settings, place, counts)
             if score > best:
                 best, best_alpha, best_index = score, alpha, index
     return best_alpha, best_index * step - settings.max_speed_px_per_ms
@@ -220,25 +221,33 @@ def vote_speed(
 
 @numba.njit(cache=True, nogil=True)
 def strongest_bins(
-    position: Array, rate: Array, gamma: float, settings: VoteSettings, counts: Array
+    position: Array,
+    rate: Array,
+    gamma: float,
+    settings: VoteSettings,
+    place: Array,
+    counts: Array,
 ) -> tuple[float, float]:
     """Score and offset (px) of the two neighbouring bins that most events fall into.
 
     Args:
         position, rate: (n,) bins at tau = 0, and bins for each px/ms of speed.
         gamma: speed, px/ms.
-        counts: buffer with one number a bin.
+        place: (n,) int32 buffer.
+        counts: buffer with one number a bin, and one more at either end.
     """
+    bin_count = len(counts) - 2
+    # A loop of arithmetic alone runs on several events at a time.
+    for k in range(len(position)):
+        shifted = position[k] - gamma * rate[k] + 1.0
+        place[k] = int(min(max(shifted, 0.0), bin_count + 1.0))
     counts[:] = 0
     for k in range(len(position)):
-        place = position[k] - gamma * rate[k]
-        # Truncation is towards zero: without the first test, (-1, 0) would count as bin 0.
-        if place >= 0.0 and place < len(counts):
-            counts[int(place)] += 1
+        counts[place[k]] += 1
     best, best_alpha = -1.0, 0.0
-    for place in range(len(counts) - 1):
-        alpha = (place + 1) * VOTE_BIN_PX - settings.candidate_distance_px
-        pair = counts[place] + counts[place + 1]
+    for first in range(1, bin_count):
+        alpha = first * VOTE_BIN_PX - settings.candidate_distance_px
+        pair = counts[first] + counts[first + 1]
         score = pair * (1.0 - VOTE_OFFSET_COST_PER_PX * abs(alpha))
         if score > best:
             best, best_alpha = score, alpha
@@ -264,25 +273,7 @@ def fit_robust(
     normal = np.empty((3, 3))
     right = np.empty(3)
     for iteration in range(FIT_ITERATION_COUNT):
-        normal[:] = 0.0
-        right[:] = 0.0
-        inliers = 0
-        for k in range(len(u)):
-            r = s[k] - plane[0] - plane[1] * u[k] - plane[2] * tau[k]
-            share = r / width
-            if abs(share) >= 1.0:
-                continue
-            inliers += 1
-            weight = (1.0 - share * share) ** 2
-            normal[0, 0] += weight
-            normal[0, 1] += weight * u[k]
-            normal[0, 2] += weight * tau[k]
-            normal[1, 1] += weight * u[k] * u[k]
-            normal[1, 2] += weight * u[k] * tau[k]
-            normal[2, 2] += weight * tau[k] * tau[k]
-            right[0] += weight * s[k]
-            right[1] += weight * s[k] * u[k]
-            right[2] += weight * s[k] * tau[k]
+        inliers = weighted_sums(u, s, tau, plane, width, normal, right)
         if inliers < 3:
             return 0
         prior = VOTE_PRIOR if iteration == 0 else SPEED_RIDGE
@@ -293,6 +284,44 @@ def fit_robust(
         if width == last_px:
             break
         width = max(width * RESIDUAL_SHRINK, last_px)
+    return inliers
+
+
+# Sums in any order, so that several events are added at a time; the order is the same in every run.
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "contract"})
+def weighted_sums(
+    u: Array, s: Array, tau: Array, plane: Array, width: float, normal: Array, right: Array
+) -> int:
+    """Normal equations of (alpha, beta, gamma) with Tukey weights about a plane.
+
+    Args:
+        plane: (3,) that residuals are taken of.
+        width: residual from which on there is no weight, px.
+        normal, right: (3, 3) upper triangle and (3,), overwritten.
+
+    Returns:
+        How many events have a weight.
+    """
+    alpha, beta, gamma = plane[0], plane[1], plane[2]
+    w, wu, wt, wuu, wut, wtt, ws, wsu, wst = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    inliers = 0
+    for k in range(len(u)):
+        share = (s[k] - alpha - beta * u[k] - gamma * tau[k]) / width
+        rest = max(1.0 - share * share, 0.0)
+        inliers += rest > 0.0
+        weight = rest * rest
+        w += weight
+        wu += weight * u[k]
+        wt += weight * tau[k]
+        wuu += weight * u[k] * u[k]
+        wut += weight * u[k] * tau[k]
+        wtt += weight * tau[k] * tau[k]
+        ws += weight * s[k]
+        wsu += weight * s[k] * u[k]
+        wst += weight * s[k] * tau[k]
+    normal[0, 0], normal[0, 1], normal[0, 2] = w, wu, wt
+    normal[1, 1], normal[1, 2], normal[2, 2] = wuu, wut, wtt
+    right[0], right[1], right[2] = ws, wsu, wst
     return inliers
 
 
