@@ -46,8 +46,8 @@ FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
 LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
 UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
-# Fits to the events of a window in a slice of the work.
-SLICE_FIT_COUNT = 4
+# Fits in a slice of the work.
+SLICE_FIT_COUNT = 6
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0
@@ -78,22 +78,29 @@ def locating(
     poses = yield from _searching(guess, sight.lines, eyes, config, rng)
     yield
     sampled = _sampled(sight.lines, window.t_us).thinned(SAMPLED_COUNT)
-    fits = [
-        fit_window(state, sampled, eyes.pieces, eyes.view, config, LINE_SCALES_PX)
-        for state in (
-            roughly_at(pose, _turning(pose, sight.turn_rate), window.t_us, config) for pose in poses
-        )
+    starts = [
+        roughly_at(pose, _turning(pose, sight.turn_rate), window.t_us, config) for pose in poses
     ]
-    best = distinct(sorted(fits, key=explained_count, reverse=True))
+    on_lines = yield from _fitting(starts, sampled, eyes, config, LINE_SCALES_PX)
     yield
-    on_events: list[WindowFit] = []
-    for fit in best:
-        if len(on_events) == SLICE_FIT_COUNT:
+    best = [fit.state for fit in on_lines]
+    return (yield from _fitting(best, window, eyes, config, UNSURE_SCALES_PX))
+
+
+def _fitting(
+    starts: Sequence[MotionState],
+    window: Window,
+    eyes: Eyes,
+    config: TrackConfig,
+    scales_px: tuple[float, ...],
+) -> Generator[None, None, list[WindowFit]]:
+    """What is left of the starts, the best first, in slices of a few of them."""
+    fits: list[WindowFit] = []
+    for count, start in enumerate(starts):
+        if count and count % SLICE_FIT_COUNT == 0:
             yield
-        on_events.append(
-            fit_window(fit.state, window, eyes.pieces, eyes.view, config, UNSURE_SCALES_PX)
-        )
-    return distinct(sorted(on_events, key=explained_count, reverse=True))
+        fits.append(fit_window(start, window, eyes.pieces, eyes.view, config, scales_px))
+    return distinct(sorted(fits, key=explained_count, reverse=True))
 
 
 def explained_count(fit: WindowFit) -> float:

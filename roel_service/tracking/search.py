@@ -19,12 +19,12 @@ from roel_service.tracking.fit import Window
 from roel_service.tracking.follower import Follower
 from roel_service.tracking.locate import locating
 from roel_service.tracking.pursuit import Pursuit
-from roel_service.tracking.sight import Eyes, look
+from roel_service.tracking.sight import Eyes, looking
 from roel_service.tracking.verdict import is_possible
 
-# What it finds goes through windows until so many fits are done, in a slice; so many events of each are
-# enough.
-SLICE_FIT_COUNT, EVENT_COUNT = 5, 4_000
+# What it finds goes through windows until so many fits are done, in a slice; about so many events of
+# each are enough.
+SLICE_FIT_COUNT, EVENT_COUNT = 5, 3_000
 
 
 class Search:
@@ -77,7 +77,7 @@ class Search:
         before: float,
     ) -> Generator[None, None, None]:
         eyes, config, rng = self._eyes, self._config, self._rng
-        sight = look(around, window.t_us, eyes, turn_rate)
+        sight = yield from looking(around, window.t_us, eyes, turn_rate)
         yield
         fits = yield from locating(place, sight, window, eyes, config, rng)
         answers = [Follower(fit, before) for fit in fits if is_possible(fit, config)]

@@ -56,9 +56,25 @@ def scores(
             vx = R[0, 0] * v[0] + R[1, 0] * v[1] + R[2, 0] * v[2]
             vy = R[0, 1] * v[0] + R[1, 1] * v[1] + R[2, 1] * v[2]
             vz = R[0, 2] * v[0] + R[1, 2] * v[1] + R[2, 2] * v[2]
-            angle = math.atan2(vy - y * vz, vx - x * vz)
-            place = math.floor(angle / math.pi * class_count + 0.5) % class_count
+            turned = half_turns(vx - x * vz, vy - y * vz)
+            place = math.floor(turned * class_count + 0.5) % class_count
             beyond_chance += fields[place, int(row), int(column)] - mean[place]
             by_chance += variance[place]
         result[b] = beyond_chance / math.sqrt(by_chance) if by_chance > 0.0 else 0.0
     return result
+
+
+@numba.njit(cache=True, nogil=True)
+def half_turns(along_x: float, along_y: float) -> float:
+    """Direction of a line in the picture, in half turns from -.5 to .5, to .0013 of one.
+
+    It takes a fifth of the time of atan2: atan(t) is nearly t (pi / 4 + .273 (1 - t)) from 0 to 1.
+    """
+    x, y = abs(along_x), abs(along_y)
+    if x + y == 0.0:
+        return 0.0
+    t = min(x, y) / max(x, y)
+    turns = t * (0.25 + 0.273 / math.pi * (1.0 - t))
+    if y > x:
+        turns = 0.5 - turns
+    return turns if along_x * along_y >= 0.0 else -turns

@@ -7,6 +7,7 @@ longer time make twice as many lines.
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from roel_service.geometry import segments
 from roel_service.geometry.projection import normalized_from_pixel
 from roel_service.geometry.se3 import SE3
 from roel_service.mapping.detect import EDLines, Seeds, detect_lines
-from roel_service.mapping.frames import event_frame
+from roel_service.mapping.frames import EventFrame, event_frame
 from roel_service.mapping.plane_fit import FittedLines, fit_space_time_planes
 from roel_service.mapping.representations import event_images
 from roel_service.scene.camera import Camera
@@ -73,33 +74,41 @@ class Sight:
 
 def glimpse(events: EventStream, t_us: int, eyes: Eyes) -> Sight:
     """Lines as they are in the events, and the turn that they tell."""
-    lines = _lines(events, t_us, eyes, np.zeros(3), BLURRED_FRAMES, BLURRED_DETECT)
+    seeds, frame = _seeds(events, t_us, eyes, np.zeros(3), BLURRED_FRAMES, BLURRED_DETECT)
+    lines = _planes(seeds, frame)
     return Sight(lines=lines, turn_rate=_turn_rate(lines, eyes.view))
 
 
-def look(events: EventStream, t_us: int, eyes: Eyes, turn_rate: FloatArray) -> Sight:
-    """Lines once a turn is undone."""
-    lines = _lines(events, t_us, eyes, turn_rate, SHARP_FRAMES, SHARP_DETECT)
+def looking(
+    events: EventStream, t_us: int, eyes: Eyes, turn_rate: FloatArray
+) -> Generator[None, None, Sight]:
+    """Lines once a turn is undone, in two slices of the work."""
+    seeds, frame = _seeds(events, t_us, eyes, turn_rate, SHARP_FRAMES, SHARP_DETECT)
+    yield
+    lines = _planes(seeds, frame)
     undone_px_ms = 1e-3 * _speeds_by_turn(lines.segments_px, eyes.view) @ turn_rate
     lines = replace(lines, normal_speed_px_per_ms=lines.normal_speed_px_per_ms + undone_px_ms)
     return Sight(lines=lines, turn_rate=turn_rate)
 
 
-def _lines(
+def _seeds(
     events: EventStream,
     t_us: int,
     eyes: Eyes,
     turn_rate: FloatArray,
     frames: FramesConfig,
     detect: DetectConfig,
-) -> FittedLines:
+) -> tuple[Seeds, EventFrame]:
     frame = event_frame(
         events, t_us, eyes.ideal_px, _turning(t_us, turn_rate), eyes.camera, frames, detect
     )
     seeds = detect_lines(event_images(frame, detect), EDLines(detect), detect)
     # The longest come first.
     longest = slice(0, MAX_LINE_COUNT)
-    seeds = Seeds(segments_px=seeds.segments_px[longest], polarity=seeds.polarity[longest])
+    return Seeds(segments_px=seeds.segments_px[longest], polarity=seeds.polarity[longest]), frame
+
+
+def _planes(seeds: Seeds, frame: EventFrame) -> FittedLines:
     # The planes are voted for: nothing is drawn.
     return fit_space_time_planes(seeds, frame, PLANES, np.random.default_rng(0))
 

@@ -63,7 +63,7 @@ def motion(t_us):
 
 
 @functools.cache
-def recording(seed=0, seconds=0.9):
+def recording(seed=0, seconds=1.0):
     segments = walls(seed)
     t_us = np.arange(0, round(seconds * 1e6) + STEP_US, STEP_US)
     poses = motion(t_us)
@@ -125,3 +125,12 @@ def window_at(t_us, events, most=8_000):
     start, stop = np.searchsorted(events.t_us, span_us)
     ideal_px = projection.undistortion_table(CAMERA)
     return window_of(events.slice(int(start), int(stop), t_us), ideal_px, span_us, most)
+
+
+def result_of(slices):
+    """What a work in slices returns, all of them done."""
+    while True:
+        try:
+            next(slices)
+        except StopIteration as end:
+            return end.value

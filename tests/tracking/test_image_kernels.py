@@ -146,3 +146,27 @@ def test_what_edges_say_adds_up_to_what_all_events_say():
         np.zeros(first.sum()), by_pose[first], after_s[first], weight[first]
     )
     np.testing.assert_allclose(of_edges[2], of_one, atol=1e-9)
+
+
+def test_steps_of_a_pose_are_those_of_the_group():
+    rng = np.random.default_rng(3)
+    pose = SE3.identity().retract(rng.normal(size=6))
+    steps = np.concatenate([rng.normal(size=(5, 6)), 1e-6 * rng.normal(size=(2, 6))])
+    rotation, centre = image_kernels.retracted(pose.rotation, pose.translation, steps)
+    np.testing.assert_allclose(rotation, pose.retract(steps).rotation, atol=1e-14)
+    np.testing.assert_allclose(centre, pose.retract(steps).translation, atol=1e-14)
+
+
+def test_all_events_of_a_piece_weigh_no_more_than_it_is_known():
+    count = 10_000
+    weight = image_kernels.event_weights(
+        np.zeros(count + 2),
+        np.r_[np.zeros(count, np.int32), np.array([1, 2], np.int32)],
+        np.array([True, True, False]),
+        np.full(3, 0.1),
+        0.5,
+        2.0,
+    )
+    assert 9.9 < weight[:count].sum() < 1 / 0.1
+    assert weight[count] == 1 / (0.5 + 0.1)
+    assert weight[count + 1] == 0.0

@@ -7,9 +7,9 @@ from roel_service.geometry.se3 import SE3, rotation_from_vector
 from roel_service.scene.lines import LineMap
 from roel_service.tracking.fit import View
 from roel_service.tracking.pieces import pieces_of
-from roel_service.tracking.sight import Eyes, glimpse, look
+from roel_service.tracking.sight import Eyes, glimpse, looking
 
-from .synthetic import CAMERA, STEP_US, events_of, walls
+from .synthetic import CAMERA, STEP_US, events_of, result_of, walls
 
 AT_US = 40_000
 
@@ -42,7 +42,7 @@ def test_lines_tell_how_fast_the_camera_turns(turning, eyes):
 
 def test_with_the_turn_undone_speeds_are_those_that_the_camera_sees(turning, eyes):
     rate, events = turning
-    lines = look(events, AT_US, eyes, rate).lines
+    lines = result_of(looking(events, AT_US, eyes, rate)).lines
     step_s = 1e-3
     turned = rotation_from_vector(step_s * rate)
     middle = segments.midpoint(lines.segments_px)
