@@ -155,7 +155,8 @@ def _associate(
     line = np.concatenate([refined.tracks.track_of_row, line])
     member = np.concatenate([refined.tracks.observation, member])
     # One number a pair: they are sorted ten times faster than columns.
-    pairs = np.unique(line.astype(np.int64) * len(observations) + member)
+    pairs = np.sort(line.astype(np.int64) * len(observations) + member)
+    pairs = pairs[np.diff(pairs, prepend=-1) > 0]
     return LineTracks.from_rows(*np.divmod(pairs, max(1, len(observations))), len(refined))
 
 

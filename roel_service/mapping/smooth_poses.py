@@ -7,13 +7,13 @@ not seen: poses that jump about are smoothed, poses without noise stay where the
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import make_smoothing_spline
 
 from roel_service.arrays import FloatArray, IntArray
 from roel_service.geometry.se3 import SE3
+from roel_service.geometry.smoothing_spline import smoothing_spline
 from roel_service.scene.trajectory import Trajectory
 
-# Fewer poses than this, halved for the choice of stiffness, are no curve to the library.
+# Fewer poses than this, halved for the choice of stiffness, are no curve.
 MIN_POSE_COUNT = 10
 # Stiffness that is tried, with the poses' median interval as the unit of time: from hardly any to
 # curves that change over some hundred poses.
@@ -35,7 +35,7 @@ def smoothed(trajectory: Trajectory) -> Trajectory:
 
 
 def _smooth_piece(t_us: IntArray, poses: SE3) -> SE3:
-    # In steps of the poses: the library's systems are badly scaled in microseconds.
+    # In steps of the poses: the systems are badly scaled in microseconds.
     steps = (t_us - t_us[0]) / np.median(np.diff(t_us))
     quaternions = _smooth_curve(steps, _continuous(poses.quaternion_xyzw()))
     return SE3.from_quaternion(quaternions, _smooth_curve(steps, poses.translation))
@@ -61,7 +61,7 @@ def _prediction_error(steps: FloatArray, values: FloatArray, stiffness: float) -
 
 
 def _spline(steps: FloatArray, values: FloatArray, stiffness: float, at: FloatArray) -> FloatArray:
-    return np.asarray(make_smoothing_spline(steps, values, lam=stiffness)(at))
+    return np.asarray(smoothing_spline(steps, values, stiffness)(at))
 
 
 def _continuous(quaternions: FloatArray) -> FloatArray:
