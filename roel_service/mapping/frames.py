@@ -205,7 +205,7 @@ def event_frame(
     start = min(first for first, _ in ranges)
     stop = max(last for _, last in ranges)
     largest = _in_fixed_order(events.slice(start, stop, t_us))
-    own_px = ideal_px[largest.y, largest.x]
+    own_px = _looked_up(ideal_px, largest)
     compensated_px = own_px
     if frames.compensate_rotation and len(largest):
         compensated_px = _compensated(largest, ideal_px, trajectory, camera.matrix, frames.slot_us)
@@ -217,6 +217,12 @@ def event_frame(
         width=camera.width,
         height=camera.height,
     )
+
+
+def _looked_up(ideal_px: Array, events: EventSlice) -> Array:
+    """(K, 2) float32 entries of an (H, W, 2) table; of rows, `take` is ten times as fast."""
+    place = events.y.astype(np.intp) * ideal_px.shape[1] + events.x
+    return np.asarray(ideal_px.reshape(-1, 2).take(place, axis=0))
 
 
 def window_event_counts(config: DetectConfig, pixel_count: int) -> tuple[int, ...]:

@@ -43,6 +43,8 @@ from roel_service.mapping.refine import (
 from roel_service.scene.lines import InfiniteLines
 
 Result = TypeVar("Result")
+# What `joint_kernels.end_residuals` and `joint_cost` share.
+SeenArguments = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
 # Those of `joint_kernels.joint_system`, but for the weights.
 SystemArguments = tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]
 
@@ -327,31 +329,31 @@ class _Problem:
 
     def residuals_px(self, state: _State) -> FloatArray:
         """(S,) distances of the observations' ends from their lines."""
-        v, m = state.lines.plucker
-        poses = self.moved_poses(state)
+        seen = self._seen(state.lines, self.moved_poses(state))
 
         def residuals_of(part: _Part) -> FloatArray:
-            return joint_kernels.end_residuals(
-                part.offsets,
-                self.origin[part.lines],
-                v[part.lines],
-                m[part.lines],
-                poses.rotation,
-                poses.translation,
-                self.frame_of,
-                self.observation[part.rows],
-                self.end_rays,
-                self.frames.focal_px,
-            )
+            return joint_kernels.end_residuals(*seen(part), self.end_rays, self.frames.focal_px)
 
         return np.concatenate(self._of_parts(residuals_of))
 
     def line_costs(self, lines: OrthonormalLines, poses: SE3, weight: FloatArray) -> FloatArray:
         """(L,) of observations and directions, with fixed (S,) weights."""
-        v, m = lines.plucker
+        seen = self._seen(lines, poses)
 
         def costs_of(part: _Part) -> FloatArray:
-            return joint_kernels.joint_cost(
+            return joint_kernels.joint_cost(*seen(part), self.forms, weight[part.rows])
+
+        cost = np.concatenate(self._of_parts(costs_of))
+        if self.directions is not None:
+            cost = cost + self.precision * direction_system(lines, self.directions).cost
+        return np.asarray(cost)
+
+    def _seen(self, lines: OrthonormalLines, poses: SE3) -> Callable[[_Part], SeenArguments]:
+        """Lines and the frames that see them, for a part of the lines."""
+        v, m = lines.plucker
+
+        def arguments(part: _Part) -> SeenArguments:
+            return (
                 part.offsets,
                 self.origin[part.lines],
                 v[part.lines],
@@ -360,14 +362,9 @@ class _Problem:
                 poses.translation,
                 self.frame_of,
                 self.observation[part.rows],
-                self.forms,
-                weight[part.rows],
             )
 
-        cost = np.concatenate(self._of_parts(costs_of))
-        if self.directions is not None:
-            cost = cost + self.precision * direction_system(lines, self.directions).cost
-        return np.asarray(cost)
+        return arguments
 
     def drift_cost(self, state: _State) -> float:
         """Of the correction itself."""

@@ -123,8 +123,8 @@ def _grid(frame: EventFrame, tau_ms: FloatArray) -> Grid:
     return Grid(
         start=start,
         order=order,
-        xy_px=frame.compensated_px[order],
-        tau_ms=tau_ms[order],
+        xy_px=frame.compensated_px.take(order, axis=0),
+        tau_ms=tau_ms.take(order),
         rows=rows,
         columns=columns,
         cell_px=CELL_PX,

@@ -37,6 +37,8 @@ FAR_PX = 4.0
 # Density that counts as empty surroundings, events for each px of length.
 EMPTY_DENSITY_PER_PX = 0.02
 MIN_EVENTS_PER_PX = 0.5
+# A frame has fewer events.
+MAX_EVENT_COUNT = 2**32
 # Cosine of the largest turn of a random plane's slice against its seed: 60 degrees.
 MIN_FACING = 0.5
 # Length of the image part of a unit normal below which a plane is an instant, not a moving line.
@@ -287,8 +289,7 @@ def fit_robust(
     return inliers
 
 
-# Sums in any order, so that several events are added at a time; the order is the same in every run.
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "nsz", "contract"})
+@numba.njit(cache=True, nogil=True)
 def weighted_sums(
     u: Array, s: Array, tau: Array, plane: Array, width: float, normal: Array, right: Array
 ) -> int:
@@ -302,23 +303,27 @@ def weighted_sums(
     Returns:
         How many events have a weight.
     """
-    alpha, beta, gamma = plane[0], plane[1], plane[2]
-    w, wu, wt, wuu, wut, wtt, ws, wsu, wst = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    inliers = 0
+    # Without a branch and without a sum, several events are weighed at a time.
+    weights = np.empty(len(u))
     for k in range(len(u)):
-        share = (s[k] - alpha - beta * u[k] - gamma * tau[k]) / width
+        share = (s[k] - plane[0] - plane[1] * u[k] - plane[2] * tau[k]) / width
         rest = max(1.0 - share * share, 0.0)
-        inliers += rest > 0.0
-        weight = rest * rest
+        weights[k] = rest * rest
+    inliers = 0
+    w, wu, wt, wuu, wut, wtt, ws, wsu, wst = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(len(u)):
+        weight = weights[k]
+        inliers += weight > 0.0
+        along, later, aside = weight * u[k], weight * tau[k], weight * s[k]
         w += weight
-        wu += weight * u[k]
-        wt += weight * tau[k]
-        wuu += weight * u[k] * u[k]
-        wut += weight * u[k] * tau[k]
-        wtt += weight * tau[k] * tau[k]
-        ws += weight * s[k]
-        wsu += weight * s[k] * u[k]
-        wst += weight * s[k] * tau[k]
+        wu += along
+        wt += later
+        wuu += along * u[k]
+        wut += along * tau[k]
+        wtt += later * tau[k]
+        ws += aside
+        wsu += aside * u[k]
+        wst += aside * tau[k]
     normal[0, 0], normal[0, 1], normal[0, 2] = w, wu, wt
     normal[1, 1], normal[1, 2], normal[2, 2] = wuu, wut, wtt
     right[0], right[1], right[2] = ws, wsu, wst
@@ -541,12 +546,13 @@ def support(
             fits = (np.abs(s - speeds[m] * tau) < max_distance_px) & (np.abs(tau) < max_tau_ms)
             found = np.concatenate((found, near[:count][fits]))
         # Equal times are told apart by the event's index: the order of the grid must not matter.
-        found = found[np.argsort(grid.order[found])]
-        found = found[np.argsort(np.abs(grid.tau_ms[found]), kind="mergesort")][:max_count]
-        while total + len(found) > len(chosen):
+        # One number for both, in whole microseconds, is sorted several times faster than two.
+        from_frame_us = np.rint(np.abs(grid.tau_ms[found]) * 1e3).astype(np.int64)
+        key = np.sort(from_frame_us * MAX_EVENT_COUNT + grid.order[found])[:max_count]
+        while total + len(key) > len(chosen):
             chosen = np.concatenate((chosen, np.empty_like(chosen)))
-        chosen[total : total + len(found)] = grid.order[found]
-        total += len(found)
+        chosen[total : total + len(key)] = key % MAX_EVENT_COUNT
+        total += len(key)
         offsets[m + 1] = total
     return offsets, chosen[:total]
 
