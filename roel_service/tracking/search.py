@@ -68,6 +68,11 @@ class Search:
         """Do the next slice."""
         next(self._slices, None)
 
+    def finish(self) -> None:
+        """Do all of them."""
+        for _ in self._slices:
+            pass
+
     def _searching(
         self,
         place: SE3,

@@ -44,8 +44,8 @@ class PoseTracker:
     events of the intervals since it began.
 
     Where several answers explain what is seen about equally well, all are followed, and the best
-    one is told as `UNCERTAIN`. While none convinces, others are looked for beside them. A search
-    takes ten intervals or so, a slice in each, on a thread of its own.
+    one is told as `UNCERTAIN`. While none convinces, others are looked for beside them. Live, a
+    search takes ten intervals or so, a slice in each, on a thread of its own.
 
     Args:
         line_map: where the camera is.
@@ -53,15 +53,24 @@ class PoseTracker:
         config: parameters.
         guess: rough `T_world_camera` of the first events, within `config.reach_m` and `reach_deg`.
         seed: fixes the chance of the search.
+        is_live: whether events come as time passes, and a pose may not wait; else a search is over in the
+            interval in which it begins, and finds the camera earlier.
 
     Raises:
         NoAnswerError: TOO_FEW_LINES in the map.
     """
 
     def __init__(
-        self, line_map: LineMap, camera: Camera, config: TrackConfig, guess: SE3, seed: int = 0
+        self,
+        line_map: LineMap,
+        camera: Camera,
+        config: TrackConfig,
+        guess: SE3,
+        seed: int = 0,
+        *,
+        is_live: bool = True,
     ) -> None:
-        self._config = config
+        self._config, self._is_live = config, is_live
         self._eyes = Eyes(
             camera=camera,
             ideal_px=undistortion_table(camera),
@@ -151,6 +160,9 @@ class PoseTracker:
             fit = self._followed(window, around)
         for each in slices:
             each.result()
+        if not self._is_live:
+            for search in self._searches:
+                search.finish()
         self._take_up()
         return _told(window, self._pursuit, fit)
 

@@ -67,6 +67,17 @@ def test_the_camera_is_looked_for_then_followed(room, followed):
     assert shift_m < 0.01
 
 
+def test_in_a_recording_a_search_is_over_in_its_interval(room):
+    first = room.pose(25_000).retract(off(1))
+    tracker = PoseTracker(room.line_map, CAMERA, CONFIG, first, is_live=False)
+    poses = tracker.push(room.events.part(0, int(np.searchsorted(room.events.t_us, 200_000))))
+    assert poses[1].status is PoseStatus.UNCERTAIN
+    assert poses[-1].status is PoseStatus.TRACKING
+    turn_deg, shift_m = errors(room, poses[1:]).max(axis=0)
+    assert turn_deg < 0.3
+    assert shift_m < 0.01
+
+
 def test_errors_go_with_the_covariances(room, followed):
     distances = []
     for pose in followed:

@@ -49,7 +49,7 @@ class TrackedRecording:
         line_map = read_map(map_name)
         with naming(self._names):
             self._tracker = PoseTracker(
-                line_map, calibration, config.track, guess, config.runtime.seed
+                line_map, calibration, config.track, guess, config.runtime.seed, is_live=False
             )
         self._relied_on: list[tuple[int, SE3]] = []
 
