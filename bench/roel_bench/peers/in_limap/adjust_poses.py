@@ -17,6 +17,7 @@ import numpy as np
 import pycolmap
 from limap import geometry, scene
 from limap.estimators import bundle_adjustment
+from lines_alone import lines_alone
 from posed_images import FIRST_IMAGE_ID, posed_images
 
 
@@ -61,17 +62,7 @@ def adjust(holistic: scene.HolisticReconstruction, iteration_count: int) -> None
     config.set_constant_rig_from_world_pose(images[FIRST_IMAGE_ID].frame_id)
     for line_id in holistic.structure_recon.lines3D:
         config.add_variable_line(line_id)
-    options = bundle_adjustment.PointLineBundleAdjustmentOptions()
-    for name in (
-        "refine_points",
-        "refine_points3D",
-        "refine_focal_length",
-        "refine_principal_point",
-        "refine_extra_params",
-        "refine_sensor_from_rig",
-        "print_summary",
-    ):
-        setattr(options, name, False)
+    options = lines_alone()
     options.refine_rig_from_world = True
     options.ceres.solver_options.max_num_iterations = iteration_count
     bundle_adjustment.create_point_line_bundle_adjuster(options, config, holistic).solve()

@@ -19,6 +19,7 @@ import numpy as np
 import pycolmap
 from limap import geometry, scene, sfm
 from limap.estimators import bundle_adjustment
+from lines_alone import lines_alone
 from posed_images import posed_images
 
 # LIMAP 1 refines with this many steps, LIMAP 2 with half of it.
@@ -106,18 +107,7 @@ def refine(holistic: scene.HolisticReconstruction, options: dict[str, Any]) -> N
         config.add_image(image_id)
     for line_id in holistic.structure_recon.lines3D:
         config.add_variable_line(line_id)
-    chosen = bundle_adjustment.PointLineBundleAdjustmentOptions()
-    for name in (
-        "refine_points",
-        "refine_points3D",
-        "refine_focal_length",
-        "refine_principal_point",
-        "refine_extra_params",
-        "refine_rig_from_world",
-        "refine_sensor_from_rig",
-        "print_summary",
-    ):
-        setattr(chosen, name, False)
+    chosen = lines_alone()
     chosen.loss_function_scale_line = options["loss_scale_px"]
     chosen.line_weight_normalization_length = options["loss_length_px"]
     chosen.ceres.solver_options.max_num_iterations = MAX_ITERATION_COUNT
