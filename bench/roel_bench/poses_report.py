@@ -32,8 +32,9 @@ by preset `paper` with true poses; then every pose but the first gets noise on i
 angles. Errors are root mean squares over the poses in 1/100 units, after alignment by rotation and
 translation, means over the draws of noise; Sim(3) also takes the scale out, which is held at that of the
 given path. The paper's own figures are 33.25 (none), 32.05 (LIMAP's reprojection), 27.95 (line
-Grassmann) and 6.92 (line and event Grassmann). All rows but the last ones refine the same tracks with this
-project's solver, `LIMAP bundle adjustment` with LIMAP's own (pylimap, seconds by the clock).
+Grassmann) and 6.92 (line and event Grassmann). `reprojection` has the loss of the LIMAP that the paper cites,
+Cauchy's at .25 px, `LIMAP 2` that of its successor, at 1 px. All rows but the last ones refine the same tracks with this
+project's solver, `LIMAP bundle adjustment` with LIMAP's own (pylimap 2, seconds by the clock).
 `default, in the map` looks for the noisy poses in the map that the default builds with true ones, which is
 as much as the rows above are given; `default` gets the events and the noisy poses alone.
 """

@@ -377,8 +377,9 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         pose_method: `smooth` (a smooth correction of the given poses, in rounds with matching) or
             `batch` (as published: one free pose a frame, with lines triangulated once; the residual
             is `grassmann` or `reprojection`).
+        pose_rate_hz: frames a second that poses are refined with, if `frames.rate_hz` is not less.
         pose_gates_px: with free poses, distance within which lines take up observations, one value
-            a round of matching and refinement.
+            a round of matching and refinement; a round is repeated while lines still move.
         pose_turn_deg: how far the given poses may be turned against one another; the first gates are
             widened to what that moves in the picture.
         pose_iteration_count: Gauss-Newton steps of lines and poses at the most, each round.
@@ -398,6 +399,7 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
     corner_depth_m: float = parameter(0.03, POSITIVE)
     free_poses: bool = False
     pose_method: str = parameter("smooth", one_of(POSE_METHODS))
+    pose_rate_hz: float = parameter(25.0, at_most(1000))
     pose_gates_px: tuple[float, ...] = parameter((3.0, 2.0, 1.3), SOME_POSITIVE)
     pose_turn_deg: float = parameter(0.78, POSITIVE)
     pose_iteration_count: int = parameter(6, UP_TO_1000)

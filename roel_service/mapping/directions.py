@@ -19,6 +19,7 @@ import numpy as np
 from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RefineRoundsConfig
 from roel_service.geometry.vectors import unit
+from roel_service.in_order import in_order
 from roel_service.mapping.refine import DirectionPrior, Refined
 
 # Lines whose direction is less certain than this say nothing about common directions.
@@ -89,12 +90,20 @@ class _UncertainDirections:
         return np.asarray(self.peak * np.exp(-0.5 * self.squared_distance(directions)))
 
 
-def direction_prior(refined: Refined, config: RefineRoundsConfig) -> DirectionPrior | None:
-    """The prior of each line, from the directions that these lines share; None if it is off."""
+def direction_prior(
+    refined: Refined, config: RefineRoundsConfig, worker_count: int = 1
+) -> DirectionPrior | None:
+    """The prior of each line, from the directions that these lines share; None if it is off.
+
+    Args:
+        refined: lines with their information.
+        config: as of `common_directions`.
+        worker_count: threads; the answer is the same with any.
+    """
     if config.direction_sigma_deg == 0.0 or len(refined) == 0:
         return None
     lines = _uncertain_directions(refined, config)
-    common = _shared_by_many(lines)
+    common = _shared_by_many(lines, worker_count)
     weight = (config.direction_noise_px / np.deg2rad(config.direction_sigma_deg)) ** 2
     if len(common) == 0:
         return DirectionPrior(direction=lines.direction, weight=np.zeros(len(refined)))
@@ -114,7 +123,7 @@ def common_directions(refined: Refined, config: RefineRoundsConfig) -> FloatArra
     return _shared_by_many(_uncertain_directions(refined, config))
 
 
-def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
+def _shared_by_many(lines: _UncertainDirections, worker_count: int = 1) -> FloatArray:
     """(D, 3) unit directions, the most frequent first."""
     lines = lines.take(lines.spread_rad < MAX_SPREAD_RAD)
     votes = np.ones(len(lines.direction))
@@ -130,7 +139,9 @@ def _shared_by_many(lines: _UncertainDirections) -> FloatArray:
     candidates = _candidates(lines)
     # A block at a time: all candidates by all lines take long to write to memory and back.
     blocks = np.array_split(candidates, 1 + len(candidates) // CANDIDATE_BLOCK_COUNT)
-    share = np.concatenate([_explained(lines, block) for block in blocks])
+    share = np.concatenate(
+        list(in_order(lambda block: _explained(lines, block), blocks, worker_count))
+    )
     while len(found) < MAX_DIRECTION_COUNT:
         strength = share @ votes
         # The mean shift can add lines to the best candidate, but hardly double them.

@@ -12,13 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
 from scipy import linalg, sparse
 
-from roel_service.arrays import Array, FloatArray, IntArray
+from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker, projection
 from roel_service.geometry.se3 import SE3, rotation_vector_jacobian
@@ -26,6 +25,7 @@ from roel_service.geometry.vectors import norm
 from roel_service.in_order import in_order
 from roel_service.mapping import joint_kernels
 from roel_service.mapping.front_end import Detected
+from roel_service.mapping.line_parts import LinePart, line_parts
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import (
     DAMPING_AFTER_FAILURE,
@@ -94,6 +94,8 @@ class JointlyRefined:
         robust_cost: of the observations by their loss and of the correction by the drift, at the end;
             what can be compared between runs.
         converged: the last step changed next to nothing.
+        moved_px: root mean square of what the observations' distances from their lines have changed
+            by, none by more than the gate.
         focal_error: what poses, lines and observations say of the calibration.
     """
 
@@ -105,6 +107,7 @@ class JointlyRefined:
     costs: list[float]
     robust_cost: float
     converged: bool
+    moved_px: float
     focal_error: FocalError
 
 
@@ -183,7 +186,7 @@ def refine_jointly(
         free_lines=free_lines,
         worker_count=worker_count,
     )
-    state = problem.first_state(refined.lines, correction, drift)
+    first = state = problem.first_state(refined.lines, correction, drift)
     damping = FIRST_DAMPING
     costs: list[float] = []
     converged = False
@@ -216,6 +219,7 @@ def refine_jointly(
         costs=[*costs, system.observation_cost],
         robust_cost=problem.robust_cost(state),
         converged=converged,
+        moved_px=problem.moved_px(first, state),
         focal_error=problem.focal_error(state, system, weight),
     )
 
@@ -228,30 +232,6 @@ def _believed(prior: DirectionPrior, lines: InfiniteLines, config: RefineConfig)
     sine = norm(np.cross(lines.direction, prior.direction))
     scale = config.max_direction_distance * np.deg2rad(config.direction_sigma_deg)
     return replace(prior, weight=prior.weight / (1.0 + (sine / scale) ** 2) ** 2)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Part:
-    """Some lines that follow each other, with their rows; the offsets are within these."""
-
-    lines: slice
-    rows: slice
-    offsets: IntArray
-
-
-def _parts(offsets: IntArray, count: int) -> list[_Part]:
-    """All lines in at most so many parts of about as many rows each; at least one part."""
-    ends_rows = np.linspace(0, offsets[-1], count + 1)[1:-1]
-    ends = np.unique([0, *np.searchsorted(offsets[:-1], ends_rows), len(offsets) - 1])
-    bounds = ends.tolist() if len(ends) > 1 else [0, 0]
-    return [
-        _Part(
-            lines=slice(first, last),
-            rows=slice(int(offsets[first]), int(offsets[last])),
-            offsets=offsets[first : last + 1] - offsets[first],
-        )
-        for first, last in pairwise(bounds)
-    ]
 
 
 class _Problem:
@@ -290,7 +270,7 @@ class _Problem:
         self.first_control, self.basis = correction.basis(frames.t_us)
         self.shares = correction.shares(frames.t_us)
         most = MAX_ELEMENT_COUNT // (6 * len(correction)) ** 2
-        self.parts = _parts(self.offsets, max(1, min(PART_COUNT, most)))
+        self.parts = line_parts(self.offsets, max(1, min(PART_COUNT, most)))
 
     def first_state(self, lines: InfiniteLines, correction: PoseCorrection, drift: Drift) -> _State:
         moment = plucker.shift_origin(lines.direction, lines.moment, self.origin)
@@ -331,16 +311,22 @@ class _Problem:
         """(S,) distances of the observations' ends from their lines."""
         seen = self._seen(state.lines, self.moved_poses(state))
 
-        def residuals_of(part: _Part) -> FloatArray:
+        def residuals_of(part: LinePart) -> FloatArray:
             return joint_kernels.end_residuals(*seen(part), self.end_rays, self.frames.focal_px)
 
         return np.concatenate(self._of_parts(residuals_of))
+
+    def moved_px(self, first: _State, last: _State) -> float:
+        """Root mean square of what residuals differ by, none by more than the gate."""
+        change_px = np.abs(self.residuals_px(last) - self.residuals_px(first))
+        capped_px = np.minimum(change_px, self.config.max_residual_px)
+        return float(np.sqrt(np.mean(capped_px**2)))
 
     def line_costs(self, lines: OrthonormalLines, poses: SE3, weight: FloatArray) -> FloatArray:
         """(L,) of observations and directions, with fixed (S,) weights."""
         seen = self._seen(lines, poses)
 
-        def costs_of(part: _Part) -> FloatArray:
+        def costs_of(part: LinePart) -> FloatArray:
             return joint_kernels.joint_cost(*seen(part), self.forms, weight[part.rows])
 
         cost = np.concatenate(self._of_parts(costs_of))
@@ -348,11 +334,11 @@ class _Problem:
             cost = cost + self.precision * direction_system(lines, self.directions).cost
         return np.asarray(cost)
 
-    def _seen(self, lines: OrthonormalLines, poses: SE3) -> Callable[[_Part], SeenArguments]:
+    def _seen(self, lines: OrthonormalLines, poses: SE3) -> Callable[[LinePart], SeenArguments]:
         """Lines and the frames that see them, for a part of the lines."""
         v, m = lines.plucker
 
-        def arguments(part: _Part) -> SeenArguments:
+        def arguments(part: LinePart) -> SeenArguments:
             return (
                 part.offsets,
                 self.origin[part.lines],
@@ -399,7 +385,7 @@ class _Problem:
         """What `joint_system` finds, by the tangents of the poses."""
         seen = self._linearised(state)
 
-        def system_of(part: _Part) -> tuple[FloatArray, ...]:
+        def system_of(part: LinePart) -> tuple[FloatArray, ...]:
             return joint_kernels.joint_system(*seen(part), weight[part.rows])
 
         cost, by_line, by_lines, by_pose, by_poses, rows = zip(
@@ -414,7 +400,7 @@ class _Problem:
             np.concatenate(rows),
         )
 
-    def _linearised(self, state: _State) -> Callable[[_Part], SystemArguments]:
+    def _linearised(self, state: _State) -> Callable[[LinePart], SystemArguments]:
         """The arguments of `joint_system` for a part of the lines, but for the weights."""
         v, m = state.lines.plucker
         jacobian = np.concatenate(
@@ -424,7 +410,7 @@ class _Problem:
         tangent = self.shares @ state.correction.control
         by_tangent = rotation_vector_jacobian(tangent[:, :3])
 
-        def arguments(part: _Part) -> SystemArguments:
+        def arguments(part: LinePart) -> SystemArguments:
             return (
                 part.offsets,
                 self.origin[part.lines],
@@ -468,7 +454,7 @@ class _Problem:
         factor = np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(inverse), -1, -2))
         frame = self.frame_of[self.observation]
 
-        def taken_by(part: _Part) -> tuple[FloatArray, FloatArray]:
+        def taken_by(part: LinePart) -> tuple[FloatArray, FloatArray]:
             return joint_kernels.eliminated(
                 part.offsets,
                 system.rows[part.rows],
@@ -489,7 +475,7 @@ class _Problem:
             system: normal equations of this state, with these (S,) weights.
         """
         gradient, hessian, by_line, by_pose = joint_kernels.focal_system(
-            *self._linearised(state)(_parts(self.offsets, 1)[0]), weight
+            *self._linearised(state)(line_parts(self.offsets, 1)[0]), weight
         )
         by_control = (self.shares.T @ by_pose).ravel()
         reduced = self.reduced(system, 0.0)
@@ -506,7 +492,7 @@ class _Problem:
         share = -(gradient - float(held @ reduced.gradient)) / information
         return FocalError(share=share, sigma=information**-0.5)
 
-    def _of_parts(self, function: Callable[[_Part], Result]) -> list[Result]:
+    def _of_parts(self, function: Callable[[LinePart], Result]) -> list[Result]:
         """What a function makes of each part of the lines; in threads, always the same parts."""
         return list(in_order(function, self.parts, self.worker_count))
 

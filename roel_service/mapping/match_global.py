@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 
 from roel_service.arrays import FloatArray, IntArray
-from roel_service.config.stages import Config, RefineRoundsConfig
+from roel_service.config.stages import Config
 from roel_service.geometry import plucker
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import norm
@@ -84,10 +84,10 @@ def reassociate(
         )
         if bright_side is not None:
             found = _one_sided(found, refined, evidence.views, bright_side)
-        refined = _held(refined, found, evidence, frames, config.refine_rounds)
+        refined = _held(refined, found, evidence, frames, config)
         refined = _without_shared(refined, len(observations), settings.max_shared_fraction)
         exclusive = _exclusive(refined, evidence.views, frames)
-        refined = _held(refined, exclusive, evidence, frames, config.refine_rounds)
+        refined = _held(refined, exclusive, evidence, frames, config)
     return refined
 
 
@@ -126,11 +126,14 @@ def _held(
     tracks: LineTracks,
     evidence: Evidence,
     frames: Frames,
-    config: RefineRoundsConfig,
+    config: Config,
 ) -> Refined:
     """The lines refined over other tracks, held by the directions that they share so far."""
-    prior = direction_prior(refined, config)
-    return _usable(refine_lines(refined.lines, tracks, evidence, frames, config, prior))
+    cost, workers = config.refine_rounds, worker_count(config)
+    prior = direction_prior(refined, cost, workers)
+    return _usable(
+        refine_lines(refined.lines, tracks, evidence, frames, cost, prior, worker_count=workers)
+    )
 
 
 def _usable(refined: Refined) -> Refined:

@@ -18,6 +18,7 @@ from roel_service.mapping.front_end import (
     Detected,
     KnownFrames,
     lines_of_all_frames,
+    worker_count,
 )
 from roel_service.mapping.match_global import reassociate
 from roel_service.mapping.match_points import point_matcher
@@ -118,9 +119,18 @@ def build_line_map(
     if config.match_global.method == "reassociate":
         refined = stages.associated(associate_again)
     with run.stage("refine"):
-        prior = direction_prior(refined, config.refine)
+        workers = worker_count(config)
+        prior = direction_prior(refined, config.refine, workers)
         refined = run.without_diverged(
-            refine_lines(refined.lines, refined.tracks, evidence, frames, config.refine, prior)
+            refine_lines(
+                refined.lines,
+                refined.tracks,
+                evidence,
+                frames,
+                config.refine,
+                prior,
+                worker_count=workers,
+            )
         )
         refined = run.without_diverged(held_at_corners(refined, evidence, frames, config))
     with run.stage("trim"):

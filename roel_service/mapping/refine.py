@@ -20,6 +20,7 @@ as n times their mean e, squared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,9 +31,11 @@ from roel_service.config.stages import RefineRoundsConfig
 from roel_service.geometry import grassmann, plucker, reprojection
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import dot, norm
+from roel_service.in_order import in_order
 from roel_service.mapping import refine_kernels
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
+from roel_service.mapping.line_parts import LinePart, line_parts
 from roel_service.mapping.views import Views, cuts_m
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
@@ -50,6 +53,8 @@ LOOSE_ITERATION_COUNT = 2
 LEAST_INFORMATION = 1e-14
 # Keeps the 4x4 systems of lines regular that no observation holds in some direction.
 RIDGE = 1e-12
+# Lines are worked on in so many parts, each in a thread.
+PART_COUNT = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,6 +80,25 @@ class Refined:
 
     def __len__(self) -> int:
         return len(self.lines)
+
+    @staticmethod
+    def joined(parts: Sequence[Refined]) -> Refined:
+        """The lines of all parts, at least one, in order."""
+        sizes = np.concatenate([part.tracks.sizes for part in parts])
+        observation = np.concatenate([part.tracks.observation for part in parts])
+        return Refined(
+            lines=InfiniteLines(
+                direction=np.concatenate([part.lines.direction for part in parts]),
+                moment=np.concatenate([part.lines.moment for part in parts]),
+            ),
+            tracks=LineTracks(
+                offsets=np.concatenate([[0], np.cumsum(sizes)]), observation=observation
+            ),
+            rms_px=np.concatenate([part.rms_px for part in parts]),
+            origin=np.concatenate([part.origin for part in parts]),
+            information=np.concatenate([part.information for part in parts]),
+            diverged=np.concatenate([part.diverged for part in parts]),
+        )
 
     def take(self, lines: Array) -> Refined:
         """The lines of these indices, or of this mask, in that order."""
@@ -116,6 +140,10 @@ class DirectionPrior:
     direction: FloatArray
     weight: FloatArray
 
+    def part(self, lines: slice) -> DirectionPrior:
+        """Of some of the lines."""
+        return DirectionPrior(direction=self.direction[lines], weight=self.weight[lines])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PointPrior:
@@ -128,6 +156,10 @@ class PointPrior:
 
     point: FloatArray
     weight: FloatArray
+
+    def part(self, lines: slice) -> PointPrior:
+        """Of some of the lines."""
+        return PointPrior(point=self.point[lines], weight=self.weight[lines])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -405,6 +437,8 @@ def refine_lines(
     config: RefineRoundsConfig,
     prior: DirectionPrior | None = None,
     corners: PointPrior | None = None,
+    *,
+    worker_count: int = 1,
 ) -> Refined:
     """Refine every line over its observations; the poses stay as they are.
 
@@ -416,7 +450,35 @@ def refine_lines(
         config: cost, loss, gates and number of steps.
         prior: directions that lines are held to, see `directions`.
         corners: points that lines are held to, see `corners`.
+        worker_count: threads; the answer is the same with any.
     """
+    # A loss that follows the residuals of all lines has to see all.
+    part_count = PART_COUNT if config.loss_scale_medians == 0.0 else 1
+
+    def refined(part: LinePart) -> Refined:
+        return _refined_part(
+            lines.take(part.lines),
+            LineTracks(offsets=part.offsets, observation=tracks.observation[part.rows]),
+            evidence,
+            frames,
+            config,
+            prior and prior.part(part.lines),
+            corners and corners.part(part.lines),
+        )
+
+    parts = line_parts(tracks.offsets, part_count)
+    return Refined.joined(list(in_order(refined, parts, worker_count)))
+
+
+def _refined_part(
+    lines: InfiniteLines,
+    tracks: LineTracks,
+    evidence: Evidence,
+    frames: Frames,
+    config: RefineRoundsConfig,
+    prior: DirectionPrior | None,
+    corners: PointPrior | None,
+) -> Refined:
     problem = _Problem(lines, tracks, evidence, frames, config, prior, corners)
     moment = plucker.shift_origin(lines.direction, lines.moment, problem.origin)
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -59,6 +60,12 @@ Costs = TypeVar("Costs", bound=RefineRoundsConfig)
 # The first gates in a given map are so much wider than those of a recording's own lines: its world
 # and that of the poses need not be quite the same.
 MAP_GATES = (4.0, 2.0)
+# A gate closes once a round has moved the lines in the pictures by less than this share of it: else others
+# would have matched. So many rounds are enough.
+SETTLED_SHARE = 0.05
+MAX_ROUND_COUNT = 3
+# Lines take so many steps while they collect observations: with the poses they move again.
+LINE_STEP_COUNT = 4
 # While the gate is wide, residuals up to this share of it count in full.
 FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
@@ -230,6 +237,8 @@ def _found(
     """One run over the events: what each window of poses has come to."""
     counted = CountedEvents(events, given)
     smooth = smoothed(given)
+    rate_hz = min(config.frames.rate_hz, config.refine.pose_rate_hz)
+    config = replace(config, frames=replace(config.frames, rate_hz=rate_hz))
     detector = line_detector(config.detect)
     detected = lines_of_all_frames(counted, smooth, camera, config, detector, run)
     counted.check_coverage()
@@ -355,6 +364,15 @@ def gates_px(config: RefineConfig, focal_px: float) -> list[float]:
     return list(given_px[-1] * np.exp(above_last))
 
 
+def closing_gates(gates: Sequence[float], found: Sequence[JointlyRefined]) -> Iterator[float]:
+    """The gate of each round, px; `found` gets what a round has come to before the next one."""
+    for gate_px in gates:
+        for _ in range(MAX_ROUND_COUNT):
+            yield gate_px
+            if found[-1].moved_px <= SETTLED_SHARE * gate_px:
+                break
+
+
 def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined:
     """Lines of neighbouring frames, triangulated as well as the poses allow."""
     frames, evidence = detected.frames, detected.evidence
@@ -379,7 +397,14 @@ def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined
         )
         loose = _with_gate(config, first_px)
         return run.without_diverged(
-            refine_lines(found.lines, found.tracks, evidence, frames, loose.refine)
+            refine_lines(
+                found.lines,
+                found.tracks,
+                evidence,
+                frames,
+                loose.refine,
+                worker_count=worker_count(config),
+            )
         )
 
 
@@ -391,10 +416,11 @@ def _with_own_lines(
     run: MappingRun,
 ) -> tuple[Refined, list[JointlyRefined]]:
     """Rounds of matching with the poses as they are, and of refining lines and poses together."""
+    workers = worker_count(config)
     refined = _first_lines(detected, config, run)
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
-    for gate_px in gates_px(config.refine, detected.frames.focal_px):
+    for gate_px in closing_gates(gates_px(config.refine, detected.frames.focal_px), found):
         gated = _with_gate(config, gate_px)
         with run.stage("match_global"):
             frames, evidence = _seen_with(detected, correction)
@@ -410,7 +436,7 @@ def _with_own_lines(
             )
         check_line_count(refined)
         with run.stage("refine"):
-            directions = direction_prior(refined, gated.refine)
+            directions = direction_prior(refined, gated.refine, workers)
             joint = refine_jointly(
                 refined,
                 correction,
@@ -418,13 +444,19 @@ def _with_own_lines(
                 detected,
                 gated.refine,
                 directions,
-                worker_count=worker_count(config),
+                worker_count=workers,
             )
             correction, drift = joint.correction, joint.drift
             frames, evidence = _seen_with(detected, correction)
             refined = run.without_diverged(
                 refine_lines(
-                    joint.lines, refined.tracks, evidence, frames, gated.refine, directions
+                    joint.lines,
+                    refined.tracks,
+                    evidence,
+                    frames,
+                    gated.refine,
+                    directions,
+                    worker_count=workers,
                 )
             )
         found.append(joint)
@@ -445,7 +477,7 @@ def _in_map(
     given_px = config.refine.pose_gates_px
     drift = Drift.configured(config.refine)
     found: list[JointlyRefined] = []
-    for gate_px in (*(wider * given_px[0] for wider in MAP_GATES), *given_px):
+    for gate_px in closing_gates([*(wider * given_px[0] for wider in MAP_GATES), *given_px], found):
         gated = _with_gate(config, gate_px)
         with run.stage("match_global"):
             frames, evidence = _seen_with(detected, correction)
@@ -476,7 +508,9 @@ def _with_gate(config: Config, gate_px: float) -> Config:
     return replace(
         config,
         match_global=replace(config.match_global, max_distances_px=(gate_px,)),
-        refine_rounds=_gated(config.refine_rounds, gate_px, scale_px),
+        refine_rounds=replace(
+            _gated(config.refine_rounds, gate_px, scale_px), iteration_count=LINE_STEP_COUNT
+        ),
         refine=_gated(config.refine, gate_px, scale_px),
     )
 

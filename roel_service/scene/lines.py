@@ -148,7 +148,7 @@ class InfiniteLines:
     def __len__(self) -> int:
         return len(self.direction)
 
-    def take(self, lines: Array) -> InfiniteLines:
+    def take(self, lines: Array | slice) -> InfiniteLines:
         """The lines of these indices, or of this mask, in that order."""
         return InfiniteLines(direction=self.direction[lines], moment=self.moment[lines])
 

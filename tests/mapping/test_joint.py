@@ -12,7 +12,7 @@ from roel_service.mapping.front_end import Detected
 from roel_service.mapping.joint import _believed, _Problem, _State, refine_jointly
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import DirectionPrior, OrthonormalLines, refine_lines
-from roel_service.mapping.views import views_of
+from roel_service.mapping.views import end_residuals_px, views_of
 
 from .synthetic import line_errors, observed, perturbed, trajectory, world
 
@@ -94,6 +94,14 @@ class TestRecovery:
         assert after_m.mean() < 0.1 * before_m.mean()
         assert after_rad.mean() < 0.1 * before_rad.mean()
         assert found.costs[-1] < 0.01 * found.costs[0]
+        # Exact observations end on their lines: all that they were off is gone.
+        views = views_of(detected.observations, detected.frames).take(start.tracks.observation)
+        lines = start.lines.take(start.tracks.track_of_row)
+        focal_px = detected.frames.focal_px
+        off_px = np.abs(end_residuals_px(views, lines.direction, lines.moment, focal_px)).max(
+            axis=1
+        )
+        assert found.moved_px == pytest.approx(np.sqrt(np.mean(off_px**2)), rel=0.05)
 
     def test_poses_are_found_among_lines_that_stay(self):
         exact = world()
@@ -113,6 +121,7 @@ class TestRecovery:
         none = PoseCorrection.none(trajectory(), INTERVAL_US)
         found = refine_jointly(lines_of(exact, detected), none, DRIFT, detected, CONFIG, None)
         assert np.abs(found.correction.control).max() < 1e-6
+        assert found.moved_px < 1e-3
         assert line_errors(found.lines, exact.segments).max() < 3e-6
 
     def test_the_drift_of_the_poses_is_learned(self):

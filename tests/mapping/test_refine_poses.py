@@ -1,4 +1,5 @@
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,12 @@ from roel_service.geometry.alignment import align_points
 from roel_service.mapping import pose_windows
 from roel_service.mapping.focal_search import with_focal
 from roel_service.mapping.pipeline import build_line_map
-from roel_service.mapping.refine_poses import gates_px, in_likeliest_world, refine_poses
+from roel_service.mapping.refine_poses import (
+    closing_gates,
+    gates_px,
+    in_likeliest_world,
+    refine_poses,
+)
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseProblem
 from roel_service.scene.trajectory import Trajectory
@@ -193,3 +199,30 @@ def test_gates_begin_as_wide_as_poses_are_turned(focal_px, given_px, expected_px
     turn_deg = float(np.degrees(6.0 / 440.0))
     config = RefineConfig(pose_gates_px=given_px, pose_turn_deg=turn_deg)
     np.testing.assert_allclose(gates_px(config, focal_px), expected_px)
+
+
+@pytest.mark.parametrize(
+    ("moved_px", "gates"),
+    [
+        ([0.04, 0.04], [1.0, 2.0]),
+        # The first gate closes once lines stay; a twentieth of it is enough.
+        ([0.3, 0.06, 0.05, 0.0], [1.0, 1.0, 1.0, 2.0]),
+        # Lines that never stay are not waited for.
+        ([0.3] * 6, [1.0] * 3 + [2.0] * 3),
+    ],
+)
+def test_a_gate_closes_once_the_lines_stay(moved_px, gates):
+    found = []
+    taken = []
+    for gate_px in closing_gates([1.0, 2.0], found):
+        taken.append(gate_px)
+        found.append(SimpleNamespace(moved_px=moved_px[len(found)]))
+    assert taken == gates
+
+
+def test_poses_take_as_many_frames_as_are_asked_for(noisy, found):
+    config = dataclasses.replace(
+        CONFIG, refine=dataclasses.replace(CONFIG.refine, pose_rate_hz=CONFIG.frames.rate_hz / 2)
+    )
+    fewer = refine_poses(event_stream(), noisy, CAMERA, config).report
+    assert 0.3 < fewer.observation_count / found.report.observation_count < 0.7
