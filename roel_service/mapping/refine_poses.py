@@ -28,7 +28,7 @@ from roel_service.mapping.first_lines import check_line_count
 from roel_service.mapping.focal_search import MAX_COST_COUNT, estimate_focal, with_focal
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected, lines_of_all_frames, worker_count
-from roel_service.mapping.joint import JointlyRefined, refine_jointly
+from roel_service.mapping.joint import FEIGNED_DRIFT, JointlyRefined, refine_jointly
 from roel_service.mapping.match_global import match_fixed_lines, reassociate
 from roel_service.mapping.match_local import match_adjacent_frames
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
@@ -64,8 +64,6 @@ MAP_GATES = (4.0, 2.0)
 # would have matched. So many rounds are enough.
 SETTLED_SHARE = 0.05
 MAX_ROUND_COUNT = 3
-# Lines take so many steps while they collect observations: with the poses they move again.
-LINE_STEP_COUNT = 4
 # While the gate is wide, residuals up to this share of it count in full.
 FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
@@ -508,9 +506,7 @@ def _with_gate(config: Config, gate_px: float) -> Config:
     return replace(
         config,
         match_global=replace(config.match_global, max_distances_px=(gate_px,)),
-        refine_rounds=replace(
-            _gated(config.refine_rounds, gate_px, scale_px), iteration_count=LINE_STEP_COUNT
-        ),
+        refine_rounds=_gated(config.refine_rounds, gate_px, scale_px),
         refine=_gated(config.refine, gate_px, scale_px),
     )
 
@@ -534,11 +530,15 @@ def _seen_with(detected: Detected, correction: PoseCorrection) -> tuple[Frames, 
 
 
 def _covariance(joint: JointlyRefined, trajectory: Trajectory) -> FloatArray:
-    """(N, 6, 6) of the poses at their own times, the lines being free."""
+    """(N, 6, 6) of the poses at their own times, the lines being free.
+
+    What observations of a line have in common is in no residual, and moves the poses all the same.
+    """
     count = len(joint.correction)
     covariance = np.linalg.inv(joint.information).reshape(count, 6, count, 6)
     first, basis = joint.correction.basis(trajectory.t_us)
-    found = np.zeros((len(trajectory), 6, 6))
+    shared = [FEIGNED_DRIFT.sigma_rad] * 3 + [FEIGNED_DRIFT.sigma_m] * 3
+    found = np.tile(np.diag(np.square(shared)), (len(trajectory), 1, 1))
     for a, b in np.ndindex(basis.shape[1], basis.shape[1]):
         share = basis[:, a] * basis[:, b]
         found += share[:, None, None] * covariance[first + a, :, first + b, :]

@@ -10,6 +10,7 @@ from roel_service.evaluation.poses import trajectory_errors, translation_errors_
 from roel_service.geometry.alignment import align_points
 from roel_service.mapping import pose_windows
 from roel_service.mapping.focal_search import with_focal
+from roel_service.mapping.joint import FEIGNED_DRIFT
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import (
     closing_gates,
@@ -66,6 +67,10 @@ class TestTogetherWithTheLines:
         assert report.iteration_count >= len(CONFIG.refine.pose_gates_px)
         assert report.seconds["refine"] > 0.0
         assert found.covariance.shape == (len(noisy), 6, 6)
+        # No pose is known better than what all observations of a line have in common.
+        variances = np.diagonal(found.covariance, axis1=1, axis2=2)
+        assert variances[:, :3].min() >= FEIGNED_DRIFT.sigma_rad**2
+        assert variances[:, 3:].min() >= FEIGNED_DRIFT.sigma_m**2
         assert np.linalg.eigvalsh(found.covariance).min() > 0.0
 
     def test_the_result_is_aligned_to_the_given_poses(self, noisy, found):
