@@ -134,7 +134,7 @@ def default_config() -> Config:
         frames=replace(config.frames, rate_hz=POSE_RATE_HZ),
         refine=replace(
             config.refine,
-            pose_rate_hz=POSE_RATE_HZ,
+            pose_rate_hz=2.0 * POSE_RATE_HZ,
             pose_interval_us=50_000,
             pose_drift_m=SMOOTH_DRIFT,
             pose_drift_s=0.3,

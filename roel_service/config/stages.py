@@ -377,7 +377,8 @@ class RefineConfig(RefineRoundsConfig, table="refine"):
         pose_method: `smooth` (a smooth correction of the given poses, in rounds with matching) or
             `batch` (as published: one free pose a frame, with lines triangulated once; the residual
             is `grassmann` or `reprojection`).
-        pose_rate_hz: frames a second that poses are refined with, if `frames.rate_hz` is not less.
+        pose_rate_hz: frames a second that poses are refined with at a focal length of 440 px, more with a
+            shorter one, which sees angles less sharply; `frames.rate_hz` at the most.
         pose_gates_px: with free poses, distance within which lines take up observations, one value
             a round of matching and refinement; a round is repeated while lines still move.
         pose_turn_deg: how far the given poses may be turned against one another; the first gates are

@@ -64,6 +64,8 @@ MAP_GATES = (4.0, 2.0)
 # would have matched. So many rounds are enough.
 SETTLED_SHARE = 0.05
 MAX_ROUND_COUNT = 3
+# The focal length that the frames' rate is configured for.
+RATE_FOCAL_PX = 440.0
 # While the gate is wide, residuals up to this share of it count in full.
 FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
@@ -235,7 +237,8 @@ def _found(
     """One run over the events: what each window of poses has come to."""
     counted = CountedEvents(events, given)
     smooth = smoothed(given)
-    rate_hz = min(config.frames.rate_hz, config.refine.pose_rate_hz)
+    sharpness = camera.focal_px / RATE_FOCAL_PX
+    rate_hz = min(config.frames.rate_hz, config.refine.pose_rate_hz / sharpness)
     config = replace(config, frames=replace(config.frames, rate_hz=rate_hz))
     detector = line_detector(config.detect)
     detected = lines_of_all_frames(counted, smooth, camera, config, detector, run)

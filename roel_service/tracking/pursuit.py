@@ -54,13 +54,6 @@ class Pursuit:
 
     def follow(self, window: Window) -> WindowFit:
         """Go on to the next window, and tell what it says of the best answer, though it be lost."""
-        best = self.hurry(window)
-        if len(self.followers) == 1 and not self.followers[0].fit.evidence.is_still:
-            self.join(self._challengers(self.followers[0], window))
-        return best
-
-    def hurry(self, window: Window) -> WindowFit:
-        """Do so without a challenge."""
         for follower in self.followers:
             follower.follow(window, self._eyes, self._config)
         best = max(self.followers, key=lambda each: each.explained_count)
@@ -77,6 +70,14 @@ class Pursuit:
         ]
         self.followers = rivals([*self.followers, *new])
 
-    def _challengers(self, follower: Follower, window: Window) -> list[Follower]:
+    def challengers(self, window: Window) -> list[Follower]:
+        """Other answers for the last window, where only one is left; they are not joined yet.
+
+        Args:
+            window: the last one.
+        """
+        if len(self.followers) != 1 or self.followers[0].fit.evidence.is_still:
+            return []
+        follower = self.followers[0]
         fits = challengers(follower.state, window, self._eyes, self._config, self._rng)
         return [follower.instead(fit) for fit in fits if is_possible(fit, self._config)]

@@ -99,4 +99,4 @@ class Search:
         fit_count = 0
         while self._waiting and not pursuit.is_over and fit_count < SLICE_FIT_COUNT:
             fit_count += len(pursuit.followers)
-            pursuit.hurry(self._waiting.popleft())
+            pursuit.follow(self._waiting.popleft())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +18,7 @@ from roel_service.scene.events import EventStream, time_not_monotone
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
 from roel_service.tracking.fit import View, Window, WindowFit, window_of
+from roel_service.tracking.follower import Follower
 from roel_service.tracking.pieces import pieces_of
 from roel_service.tracking.pursuit import Pursuit
 from roel_service.tracking.search import Search
@@ -84,8 +85,10 @@ class PoseTracker:
         # Of the camera, rad/s in its own axes.
         self._turn_rate = np.zeros(3)
         self._pursuit = Pursuit([], self._eyes, config, self._rng)
-        # The first one goes on.
+        # The first one goes on, in a slice that has begun.
         self._searches: list[Search] = []
+        self._slices: list[Future[None]] = []
+        self._challenges: list[Future[list[Follower]]] = []
         # Windows since the camera was lost, and since it was known well.
         self._lost_count = self._unsure_count = 0
         self._whereabouts = Whereabouts(guess, self._eyes.pieces.extent_m)
@@ -150,24 +153,36 @@ class PoseTracker:
         window = window_of(events, self._eyes.ideal_px, span_us, self._config.max_event_count)
         around = _between(buffer, self._next_us - FINDING_HALF_US, self._next_us + self._reach_us())
         self._next_us += self._config.interval_us
+        self._gather()
         for search in self._searches:
             search.see(window)
-        slices = [self._beside.submit(search.go_on) for search in self._searches[:1]]
+        # What is done beside is gathered with the next window: no pose waits for it.
+        self._slices = [self._beside.submit(search.go_on) for search in self._searches[:1]]
         fit: WindowFit | None = None
         if self._pursuit.is_over:
             self._watched(window, around)
         else:
             fit = self._followed(window, around)
-        for each in slices:
-            each.result()
+        if not self._slices:
+            # A search is a challenge itself.
+            self._challenges = [self._beside.submit(self._pursuit.challengers, window)]
         if not self._is_live:
-            for search in self._searches:
-                search.finish()
-        self._take_up()
+            self._gather(finish=True)
         return _told(window, self._pursuit, fit)
 
-    def _take_up(self) -> None:
-        """What a search has found, once it is up to date; then the others are idle."""
+    def _gather(self, *, finish: bool = False) -> None:
+        """What was done beside: the challenge, and the slice of the search, or all of it.
+
+        What a search has found is taken up once it is up to date; then the others are idle.
+        """
+        for challenge in self._challenges:
+            self._pursuit.join(challenge.result())
+        for each in self._slices:
+            each.result()
+        self._challenges, self._slices = [], []
+        if finish:
+            for search in self._searches:
+                search.finish()
         for search in self._searches:
             if search.found is not None and not search.found.is_over:
                 self._pursuit.join(search.found.followers)
@@ -221,7 +236,7 @@ class PoseTracker:
 
     def _lose(self) -> None:
         self._pursuit = Pursuit([], self._eyes, self._config, self._rng)
-        self._searches = []
+        self._searches, self._challenges = [], []
         self._lost_count = self._unsure_count = 0
 
 

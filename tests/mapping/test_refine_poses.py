@@ -13,6 +13,7 @@ from roel_service.mapping.focal_search import with_focal
 from roel_service.mapping.joint import FEIGNED_DRIFT
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import (
+    RATE_FOCAL_PX,
     closing_gates,
     gates_px,
     in_likeliest_world,
@@ -226,8 +227,8 @@ def test_a_gate_closes_once_the_lines_stay(moved_px, gates):
 
 
 def test_poses_take_as_many_frames_as_are_asked_for(noisy, found):
-    config = dataclasses.replace(
-        CONFIG, refine=dataclasses.replace(CONFIG.refine, pose_rate_hz=CONFIG.frames.rate_hz / 2)
-    )
-    fewer = refine_poses(event_stream(), noisy, CAMERA, config).report
-    assert 0.3 < fewer.observation_count / found.report.observation_count < 0.7
+    rate_hz = CONFIG.frames.rate_hz / 2 * CAMERA.focal_px / RATE_FOCAL_PX
+    fewer = dataclasses.replace(CONFIG.refine, pose_rate_hz=rate_hz)
+    config = dataclasses.replace(CONFIG, refine=fewer)
+    report = refine_poses(event_stream(), noisy, CAMERA, config).report
+    assert 0.3 < report.observation_count / found.report.observation_count < 0.7
