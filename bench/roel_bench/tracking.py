@@ -68,7 +68,7 @@ class Trial:
         wrong_count: poses told as TRACKING that are wrong.
         median_deg, median_mm, p95_deg, p95_mm, worst_deg, worst_mm: errors of all poses but lost
             ones; null without any.
-        nees: mean of the squared errors against their covariances; 6 where these are honest.
+        nees: mean over TRACKING poses of the squared error against the covariance; 6 where it is honest.
         found_s: time until a pose was TRACKING and near the truth; after the cut for `silence` and `jump`.
         processor_ms: processor time of a pose, in the mean.
         following_ms, searching_ms: time by the clock of a pose that is told, and of one that is LOST:
@@ -200,7 +200,7 @@ def trial(
             )
             for pose in poses
         ]
-    errors, nees = _errors(walk.trajectory, told)
+    errors, squares = _errors(walk.trajectory, told)
     is_wrong = (errors[:, 0] > WRONG_DEG) | (errors[:, 1] > 1e3 * WRONG_M)
     is_near = (errors[:, 0] < FOUND_DEG) & (errors[:, 1] < 1e3 * FOUND_M)
     is_told = np.array([pose.status is PoseStatus.TRACKING for pose, _ in told])
@@ -218,7 +218,7 @@ def trial(
         lost_count=sum(pose.status is PoseStatus.LOST for pose, _ in told),
         wrong_count=int((is_told & is_wrong).sum()),
         **quantiles,
-        nees=round(float(np.mean(nees)), 2) if len(nees) else None,
+        nees=round(float(np.mean(squares[is_told])), 2) if is_told.any() else None,
         found_s=round((int(found[0]) - since_us) * 1e-6, 3) if len(found) else None,
         processor_ms=round(1e3 * busy_s / max(1, len(told)), 2),
         following_ms=_spread_ms(following_s),
@@ -237,16 +237,16 @@ def _spread_ms(seconds: Sequence[float]) -> tuple[float, float, float] | None:
 def _errors(
     trajectory: Trajectory, told: Sequence[tuple[TrackedPose, int]]
 ) -> tuple[FloatArray, FloatArray]:
-    """(N, 2) degrees and mm, infinite for lost poses; (n,) normalised squares of the others."""
-    errors, squares = np.full((len(told), 2), np.inf), []
+    """(N, 2) degrees and mm, and (N,) normalised squares; infinite for lost poses."""
+    errors, squares = np.full((len(told), 2), np.inf), np.full(len(told), np.inf)
     for row, (pose, t_us) in enumerate(told):
         if pose.T_world_camera is None or pose.covariance is None:
             continue
         step = pose.T_world_camera.local(trajectory.interpolate(np.array([t_us]))[0])
         turn_rad, shift_m = np.linalg.norm(step.reshape(2, 3), axis=1)
         errors[row] = np.rad2deg(turn_rad), 1e3 * shift_m
-        squares.append(step @ np.linalg.solve(pose.covariance, step))
-    return errors, np.array(squares)
+        squares[row] = step @ np.linalg.solve(pose.covariance, step)
+    return errors, squares
 
 
 def _quantiles(errors: FloatArray) -> dict[str, float | None]:
