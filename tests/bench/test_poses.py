@@ -3,7 +3,7 @@ import pytest
 
 from roel_bench import poses, poses_report
 from roel_bench.poses import PoseResults, read_results, write_results
-from roel_bench.poses_cube import METHODS, CubeRow, default_config
+from roel_bench.poses_cube import IN_A_MAP, METHODS, CubeRow, default_config
 from roel_bench.poses_rooms import PoseErrors, RoomRow, normalised_errors
 from roel_service.config.presets import preset
 from roel_service.errors import InputError
@@ -123,3 +123,36 @@ def test_errors_drawn_from_the_covariance_are_honest():
 def test_the_page_is_that_of_the_committed_rows():
     page = poses_report.document(read_results(poses_report.RESULTS))
     assert poses_report.DOCUMENT.read_text(encoding="utf-8") == page
+
+
+class TestTheCommittedRows:
+    """What refinement is held to; a row that falls short is no row to commit unnoticed."""
+
+    def test_the_cube_has_the_papers_order_and_a_fraction_of_its_error(self):
+        rows = read_results(poses_report.RESULTS).cube
+        of_method = {
+            method: [row.ate_hundredths for row in rows if row.method == method]
+            for method in (*METHODS, IN_A_MAP)
+        }
+        assert {len(errors) for errors in of_method.values()} == {5}
+        means = [float(np.mean(of_method[method])) for method in list(METHODS)[:4]]
+        assert means == sorted(means, reverse=True)
+        assert max(of_method[IN_A_MAP]) < 2.0
+
+    @pytest.mark.parametrize(("width", "share"), [(640, 0.45), (346, 0.7)])
+    def test_poses_of_rooms_get_better_everywhere(self, width, share):
+        rooms = read_results(poses_report.RESULTS).rooms
+        rooms = [room for room in rooms if room.sensor.startswith(f"{width}x")]
+        assert len(rooms) == 3
+        pairs = [(room.refined, room.given) for room in rooms]
+        shifts = [refined.ate_mm / given.ate_mm for refined, given in pairs]
+        turns = [refined.rotation_deg / given.rotation_deg for refined, given in pairs]
+        assert np.mean(shifts) <= share
+        assert np.mean(turns) <= 0.4
+        assert max(*shifts, *turns) < 1.0
+
+    def test_exact_poses_stay_and_covariances_and_maps_are_good(self):
+        rooms = read_results(poses_report.RESULTS).rooms
+        assert max(room.exact.ate_mm for room in rooms) < 0.5
+        assert 0.5 <= np.mean([room.nees for room in rooms]) <= 2.0
+        assert np.mean([room.iou_refined / room.iou_true for room in rooms]) >= 0.85
