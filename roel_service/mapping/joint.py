@@ -25,7 +25,7 @@ from roel_service.geometry.vectors import norm
 from roel_service.in_order import in_order
 from roel_service.mapping import joint_kernels
 from roel_service.mapping.front_end import Detected
-from roel_service.mapping.line_parts import LinePart, line_parts
+from roel_service.mapping.line_parts import PART_COUNT, LinePart, line_parts
 from roel_service.mapping.pose_correction import Drift, PoseCorrection
 from roel_service.mapping.refine import (
     DAMPING_AFTER_FAILURE,
@@ -56,9 +56,8 @@ FEIGNED_DRIFT = Drift(sigma_rad=float(np.deg2rad(0.03)), sigma_m=1e-3, forgets_s
 LEAST_DRIFT_SHARE = 0.01
 # A step that lowers the cost by less than this share ends the iteration.
 CONVERGED_SHARE = 1e-4
-# Lines are worked on in so many parts, each in a thread, as long as what they take from the control
-# points' equations has at most so many elements in all: 64 MiB.
-PART_COUNT = 4
+# What the parts of the lines take from the control points' equations has at most so many elements in
+# all: 64 MiB. There are fewer parts else.
 MAX_ELEMENT_COUNT = 2**23
 
 

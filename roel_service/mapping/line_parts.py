@@ -9,6 +9,9 @@ import numpy as np
 
 from roel_service.arrays import IntArray
 
+# Lines are worked on in so many parts, each in a thread.
+PART_COUNT = 4
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinePart:

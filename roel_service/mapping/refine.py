@@ -35,7 +35,7 @@ from roel_service.in_order import in_order
 from roel_service.mapping import refine_kernels
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.line_parts import LinePart, line_parts
+from roel_service.mapping.line_parts import PART_COUNT, LinePart, line_parts
 from roel_service.mapping.views import Views, cuts_m
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
@@ -53,8 +53,6 @@ LOOSE_ITERATION_COUNT = 2
 LEAST_INFORMATION = 1e-14
 # Keeps the 4x4 systems of lines regular that no observation holds in some direction.
 RIDGE = 1e-12
-# Lines are worked on in so many parts, each in a thread.
-PART_COUNT = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

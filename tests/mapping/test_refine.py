@@ -361,13 +361,13 @@ class TestNoise:
 
     def test_the_loss_stays_as_sharp_as_configured_on_good_observations(self):
         spoilt, _ = self.outlying()
-        fixed = dataclasses.replace(PIXEL, loss_scale_px=0.35, event_weight=0.0)
+        # As good as off, and all lines at once all the same: parts of them are rounded in other ways.
+        fixed = dataclasses.replace(
+            PIXEL, loss_scale_px=0.35, event_weight=0.0, loss_scale_medians=1e-9
+        )
         config = dataclasses.replace(fixed, loss_scale_medians=3.0)
-        # All lines at once and a part of them at a time are rounded in other ways.
-        np.testing.assert_allclose(
-            refined(spoilt, config=config).lines.moment,
-            refined(spoilt, config=fixed).lines.moment,
-            atol=1e-12,
+        np.testing.assert_array_equal(
+            refined(spoilt, config=config).lines.moment, refined(spoilt, config=fixed).lines.moment
         )
 
     def test_the_gate_removes_outliers_and_the_lines_are_exact_again(self):
