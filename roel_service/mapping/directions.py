@@ -20,6 +20,8 @@ from roel_service.arrays import Array, FloatArray
 from roel_service.config.stages import RefineRoundsConfig
 from roel_service.geometry.vectors import unit
 from roel_service.in_order import in_order
+from roel_service.mapping import directions_kernels
+from roel_service.mapping.directions_kernels import MIN_COSINE
 from roel_service.mapping.refine import DirectionPrior, Refined
 
 # Lines whose direction is less certain than this say nothing about common directions.
@@ -83,11 +85,13 @@ class _UncertainDirections:
         outer = directions[:, first] * directions[:, second] * np.where(first == second, 1.0, 2.0)
         squared = outer @ self.precision[:, first, second].T
         cosine = directions @ self.direction.T
-        return np.asarray(np.where(np.abs(cosine) > 0.5, squared, np.inf))
+        return np.asarray(np.where(np.abs(cosine) > MIN_COSINE, squared, np.inf))
 
     def density(self, directions: FloatArray) -> FloatArray:
         """(D, L) per steradian."""
-        return np.asarray(self.peak * np.exp(-0.5 * self.squared_distance(directions)))
+        return np.asarray(
+            directions_kernels.densities(directions, self.direction, self.precision, self.peak)
+        )
 
 
 def direction_prior(

@@ -9,7 +9,7 @@ from roel_service.errors import NoAnswerError
 from roel_service.mapping.cached_stages import triangulation_cost
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.frames import Frames
-from roel_service.mapping.front_end import Detected
+from roel_service.mapping.front_end import Detected, worker_count
 from roel_service.mapping.match_local import match_adjacent_frames
 from roel_service.mapping.match_points import PointLineMatcher, PointMatcher
 from roel_service.mapping.match_sampled import (
@@ -71,10 +71,24 @@ def triangulated_lines(
     run: MappingRun,
 ) -> Refined:
     """First 3D lines, refined over their inliers and, if configured, without duplicates."""
-    found = triangulate_tracks(tracks, evidence.views, frames, config.triangulate, rng)
+    found = triangulate_tracks(
+        tracks,
+        evidence.views,
+        frames,
+        config.triangulate,
+        rng,
+        worker_count=worker_count(config),
+    )
     run.count([status for status in found.statuses if status is not TrackStatus.TRIANGULATED])
     refined = run.without_diverged(
-        refine_lines(found.lines, found.tracks, evidence, frames, triangulation_cost(config))
+        refine_lines(
+            found.lines,
+            found.tracks,
+            evidence,
+            frames,
+            triangulation_cost(config),
+            worker_count=worker_count(config),
+        )
     )
     if not config.triangulate.merge:
         return refined

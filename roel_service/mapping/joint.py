@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -38,6 +39,7 @@ from roel_service.mapping.refine import (
     DirectionPrior,
     OrthonormalLines,
     Refined,
+    direction_cost,
     direction_system,
 )
 from roel_service.scene.lines import InfiniteLines
@@ -82,32 +84,60 @@ class FocalError:
 class JointlyRefined:
     """Lines and the correction of the poses that they were refined with.
 
+    What is known of them is worked out when it is asked for: of many rounds, only the last one is.
+
     Attributes:
         lines: L lines, world.
         correction: of the trajectory that the frames' poses came from.
         drift: of that trajectory, as the correction tells it, in position no larger than expected.
         drift_told: the same, however large.
-        information: (6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2.
-        costs: of the observations after each step, the first one before any; in units of their
-            noise.
-        robust_cost: of the observations by their loss and of the correction by the drift, at the end;
-            what can be compared between runs.
+        costs: of the observations before each step; in units of their noise.
         converged: the last step changed next to nothing.
         moved_px: root mean square of what the observations' distances from their lines have changed
             by, none by more than the gate.
-        focal_error: what poses, lines and observations say of the calibration.
+        problem, end: what was solved, and its solution.
     """
 
     lines: InfiniteLines
     correction: PoseCorrection
     drift: Drift
     drift_told: Drift
-    information: FloatArray
     costs: list[float]
-    robust_cost: float
     converged: bool
     moved_px: float
-    focal_error: FocalError
+    problem: _Problem
+    end: _State
+
+    @cached_property
+    def _weight(self) -> FloatArray:
+        return self.problem.weight(self.end, loose=False)
+
+    @cached_property
+    def _system(self) -> _System:
+        return self.problem.system(self.end, self._weight)
+
+    @property
+    def cost(self) -> float:
+        """Of the observations at the end, in units of their noise."""
+        return self._system.observation_cost
+
+    @property
+    def robust_cost(self) -> float:
+        """Of the observations by their loss and of the correction by the drift, at the end.
+
+        It can be compared between runs.
+        """
+        return self.problem.robust_cost(self.end)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """(6 K, 6 K) of the control points, the lines being free; 1/(rad, m)^2."""
+        return self.problem.reduced(self._system, 0.0).hessian
+
+    @property
+    def focal_error(self) -> FocalError:
+        """What poses, lines and observations say of the calibration."""
+        return self.problem.focal_error(self.end, self._system, self._weight)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -207,19 +237,16 @@ def refine_jointly(
         converged = system.cost - cost <= CONVERGED_SHARE * system.cost
         if converged and iteration >= LOOSE_ITERATION_COUNT:
             break
-    weight = problem.weight(state, loose=False)
-    system = problem.system(state, weight)
     return JointlyRefined(
         lines=problem.world_lines(state),
         correction=state.correction,
         drift=state.drift,
         drift_told=state.drift_told,
-        information=problem.reduced(system, 0.0).hessian,
-        costs=[*costs, system.observation_cost],
-        robust_cost=problem.robust_cost(state),
+        costs=costs,
         converged=converged,
         moved_px=problem.moved_px(first, state),
-        focal_error=problem.focal_error(state, system, weight),
+        problem=problem,
+        end=state,
     )
 
 
@@ -330,7 +357,7 @@ class _Problem:
 
         cost = np.concatenate(self._of_parts(costs_of))
         if self.directions is not None:
-            cost = cost + self.precision * direction_system(lines, self.directions).cost
+            cost = cost + self.precision * direction_cost(lines, self.directions)
         return np.asarray(cost)
 
     def _seen(self, lines: OrthonormalLines, poses: SE3) -> Callable[[LinePart], SeenArguments]:

@@ -309,11 +309,16 @@ def weighted_sums(
         share = (s[k] - plane[0] - plane[1] * u[k] - plane[2] * tau[k]) / width
         rest = max(1.0 - share * share, 0.0)
         weights[k] = rest * rest
+    # Most have none: only the others are added up.
+    inside = np.empty(len(u), np.int64)
     inliers = 0
-    w, wu, wt, wuu, wut, wtt, ws, wsu, wst = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(u)):
+        inside[inliers] = k
+        inliers += weights[k] > 0.0
+    w, wu, wt, wuu, wut, wtt, ws, wsu, wst = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(inliers):
+        k = inside[i]
         weight = weights[k]
-        inliers += weight > 0.0
         along, later, aside = weight * u[k], weight * tau[k], weight * s[k]
         w += weight
         wu += along

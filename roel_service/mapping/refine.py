@@ -48,6 +48,8 @@ MAX_TURN_RAD = 0.2
 # In the first steps outliers may lie this much farther out than later.
 FIRST_GATE = 1.5
 LOOSE_ITERATION_COUNT = 2
+# A line rests once a step lowers its cost by no more than this share: far less than it is uncertain.
+RESTING_SHARE = 1e-6
 # Information that no observation gives, as a share of the whole: above float64's rounding, so that
 # what nothing tells is very uncertain, not certain.
 LEAST_INFORMATION = 1e-14
@@ -216,22 +218,28 @@ class _Problem:
         self.corners = corners and replace(corners, point=corners.point - self.origin)
         # (S, 3) about the origin of each row's line.
         self.centre = centre - self.origin[self.line]
+        self.end_rays = evidence.views.end_rays.take(self.observation, axis=0)
         length_px = evidence.views.length_px[self.observation]
         length = np.minimum(length_px, config.max_length_weight_px)
         if config.residual == "grassmann":
             # As published: the length in pixels, and lambda for each event.
             self.weight = length
-            forms = evidence.event_forms
             self.form_weight = config.event_weight * evidence.event_counts[tracks.observation]
+            form_weights = 0.0, 1.0
         else:
-            forms = config.event_weight * evidence.event_forms
-            if config.residual == "pixel":
-                forms = evidence.segment_forms + forms
-            forms = self.focal_px**2 * forms
             self.weight = length / config.max_length_weight_px
             self.form_weight = self.weight
+            px2 = self.focal_px**2
+            of_segments = px2 if config.residual == "pixel" else 0.0
+            form_weights = of_segments, px2 * config.event_weight
         self.forms = refine_kernels.world_forms(
-            self.centre, self.rotation, evidence.views.frame, self.observation, forms
+            self.centre,
+            self.rotation,
+            evidence.views.frame,
+            self.observation,
+            evidence.segment_forms,
+            evidence.event_forms,
+            *form_weights,
         )
 
     @cached_property
@@ -254,17 +262,9 @@ class _Problem:
     def residual_px(self, state: OrthonormalLines) -> FloatArray:
         """(S,) larger end residual of each observation, px."""
         v, m = state.plucker
-        views = self.evidence.views
         return np.asarray(
             refine_kernels.end_residuals(
-                self.offsets,
-                self.origin,
-                v,
-                m,
-                views.centre,
-                views.end_rays,
-                self.observation,
-                self.focal_px,
+                self.offsets, v, m, self.centre, self.end_rays, self.focal_px
             )
         )
 
@@ -283,6 +283,8 @@ class _Problem:
 
     def _loss_scale_px(self, residual_px: FloatArray) -> float:
         """Where the loss bends: it follows the residuals of a recording worse than expected."""
+        if self.config.loss_scale_medians == 0.0:
+            return self.config.loss_scale_px
         inlier_px = residual_px[self.inliers(residual_px, loose=False)]
         median_px = float(np.median(inlier_px)) if inlier_px.size else 0.0
         return max(self.config.loss_scale_px, self.config.loss_scale_medians * median_px)
@@ -293,7 +295,7 @@ class _Problem:
         if self.config.residual != "pixel":
             cost = cost + self._line_system(state, weight * self.weight).cost
         if self.prior is not None:
-            cost = cost + direction_system(state, self.prior).cost
+            cost = cost + direction_cost(state, self.prior)
         if self.corners is not None:
             cost = cost + _point_system(state, self.corners).cost
         return cost
@@ -403,14 +405,16 @@ class _Problem:
 
 def direction_system(state: OrthonormalLines, prior: DirectionPrior) -> NormalEquations:
     """Of sum w |v x d|^2, the squared sine between line and direction."""
-    v, _ = state.plucker
-    dv, _ = plucker.plucker_jacobians(state.U, state.phi)
-    r = np.cross(v, prior.direction)
-    J = np.cross(dv, prior.direction[..., None], axisa=-2, axisb=-2, axisc=-2)
-    return NormalEquations(
-        cost=prior.weight * dot(r, r),
-        gradient=prior.weight[:, None] * np.einsum("lij,li->lj", J, r),
-        hessian=prior.weight[:, None, None] * np.swapaxes(J, -1, -2) @ J,
+    cost, gradient, hessian = refine_kernels.direction_system(
+        state.U, prior.direction, prior.weight
+    )
+    return NormalEquations(cost=cost, gradient=gradient, hessian=hessian)
+
+
+def direction_cost(state: OrthonormalLines, prior: DirectionPrior) -> FloatArray:
+    """(L,) that of `direction_system`."""
+    return np.asarray(
+        refine_kernels.direction_cost(state.U[:, :, 0], prior.direction, prior.weight)
     )
 
 
@@ -482,12 +486,17 @@ def _refined_part(
     U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
     state = OrthonormalLines(U=U, phi=phi)
     damping = np.full(len(lines), FIRST_DAMPING)
-    weight = np.zeros(len(problem.line))
+    moves = np.ones(len(lines), dtype=bool)
     for iteration in range(config.iteration_count):
+        is_loose = iteration < LOOSE_ITERATION_COUNT
         residual_px = problem.residual_px(state)
-        inlier = problem.inliers(residual_px, loose=iteration < LOOSE_ITERATION_COUNT)
+        inlier = problem.inliers(residual_px, loose=is_loose)
+        # Rows of lines that rest cost nothing.
+        inlier &= moves[problem.line]
         weight = problem.robust_weight(state, residual_px) * inlier
-        state, damping = _step(problem, state, weight, damping)
+        state, damping, can_rest = _step(problem, state, weight, damping, moves)
+        if not is_loose:
+            moves &= ~can_rest
     residual_px = problem.residual_px(state)
     inlier = problem.inliers(residual_px, loose=False)
     weight = problem.robust_weight(state, residual_px) * inlier
@@ -500,26 +509,36 @@ def _refined_part(
 
 
 def _step(
-    problem: _Problem, state: OrthonormalLines, weight: FloatArray, damping: FloatArray
-) -> tuple[OrthonormalLines, FloatArray]:
-    """One damped step of every line; a line whose cost would grow stays and is damped more."""
+    problem: _Problem,
+    state: OrthonormalLines,
+    weight: FloatArray,
+    damping: FloatArray,
+    moves: BoolArray,
+) -> tuple[OrthonormalLines, FloatArray, BoolArray]:
+    """One damped step of the lines that move; one whose cost would grow stays and is damped more.
+
+    Returns:
+        The lines, their damping, and (L,) which of them have next to nothing to gain.
+    """
     system = problem.system(state, weight)
     diagonal = np.einsum("lii->li", system.hessian)
     damped = system.hessian + np.einsum(
         "li,ij->lij", damping[:, None] * diagonal + RIDGE, np.eye(4)
     )
     delta = -np.linalg.solve(damped, system.gradient[..., None])[..., 0]
+    gain = -dot(delta, system.gradient)
     turn = np.linalg.norm(delta[:, :3], axis=1)
     delta *= np.minimum(1.0, MAX_TURN_RAD / np.maximum(turn, MAX_TURN_RAD))[:, None]
     U, phi = plucker.retract_orthonormal(state.U, state.phi, delta)
     trial = OrthonormalLines(U=U, phi=phi)
-    better = problem.cost(trial, weight) <= system.cost
+    better = moves & (problem.cost(trial, weight) <= system.cost)
     return (
         OrthonormalLines(
             U=np.where(better[:, None, None], trial.U, state.U),
             phi=np.where(better, trial.phi, state.phi),
         ),
         damping * np.where(better, DAMPING_AFTER_SUCCESS, DAMPING_AFTER_FAILURE),
+        better & (gain <= RESTING_SHARE * system.cost),
     )
 
 

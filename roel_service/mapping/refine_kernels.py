@@ -29,40 +29,82 @@ def into_camera(R: Array, cx: float, cy: float, cz: float, v: Array, m: Array, o
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def end_residuals(
-    offsets: Array,
-    origin: Array,
-    v: Array,
-    m: Array,
-    centre: Array,
-    end_rays: Array,
-    observation: Array,
-    focal_px: float,
+    offsets: Array, v: Array, m: Array, centre: Array, end_rays: Array, focal_px: float
 ) -> Array:
     """(S,) the larger distance of the observed ends from the line's image, as angle times f.
 
     Args:
         offsets: (L + 1,) rows of each line.
-        origin: (L, 3) m, world, about which `m` is taken.
-        v, m: (L, 3).
-        centre: (M, 3) camera centres of all observations, m, world.
-        end_rays: (M, 2, 3) unit rays of their ends, world.
-        observation: (S,) of each row.
+        v, m: (L, 3), about the line's origin.
+        centre: (S, 3) camera centre of each row, m, world, about the origin of its line.
+        end_rays: (S, 2, 3) unit rays of its ends, world.
     """
-    residual = np.empty(len(observation))
+    residual = np.empty(len(centre))
     for line in range(len(v)):
         for row in range(offsets[line], offsets[line + 1]):
-            k = observation[row]
-            cx = centre[k, 0] - origin[line, 0]
-            cy = centre[k, 1] - origin[line, 1]
-            cz = centre[k, 2] - origin[line, 2]
+            cx, cy, cz = centre[row]
             a = m[line, 0] - (cy * v[line, 2] - cz * v[line, 1])
             b = m[line, 1] - (cz * v[line, 0] - cx * v[line, 2])
             c = m[line, 2] - (cx * v[line, 1] - cy * v[line, 0])
             norm = np.sqrt(a * a + b * b + c * c)
-            first = abs(end_rays[k, 0, 0] * a + end_rays[k, 0, 1] * b + end_rays[k, 0, 2] * c)
-            second = abs(end_rays[k, 1, 0] * a + end_rays[k, 1, 1] * b + end_rays[k, 1, 2] * c)
+            first = abs(end_rays[row, 0, 0] * a + end_rays[row, 0, 1] * b + end_rays[row, 0, 2] * c)
+            second = abs(
+                end_rays[row, 1, 0] * a + end_rays[row, 1, 1] * b + end_rays[row, 1, 2] * c
+            )
             residual[row] = focal_px * max(first, second) / norm
     return residual
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def direction_cost(v: Array, direction: Array, weight: Array) -> Array:
+    """(L,) the cost alone; arguments as in `direction_system`."""
+    cost = np.zeros(len(v))
+    for line in range(len(v)):
+        if weight[line] > 0.0:
+            x, y, z = crossed(v[line], direction[line])
+            cost[line] = weight[line] * (x * x + y * y + z * z)
+    return cost
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def direction_system(U: Array, direction: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Cost, gradient and Hessian of w |v x d|^2, the squared sine between line and direction.
+
+    Args:
+        U: (L, 3, 3) of the orthonormal form; v is its first column.
+        direction: (L, 3) unit vectors d.
+        weight: (L,) w.
+
+    Returns:
+        (L,), (L, 4) and (L, 4, 4).
+    """
+    cost = direction_cost(U[:, :, 0], direction, weight)
+    gradient = np.zeros((len(U), 4))
+    hessian = np.zeros((len(U), 4, 4))
+    for line in range(len(U)):
+        if not weight[line] > 0.0:
+            continue
+        # dv = d3 u2 - d2 u3.
+        ax, ay, az = crossed(U[line, :, 0], direction[line])
+        bx, by, bz = crossed(U[line, :, 1], direction[line])
+        cx, cy, cz = crossed(U[line, :, 2], direction[line])
+        w = weight[line]
+        gradient[line, 1] = -w * (ax * cx + ay * cy + az * cz)
+        gradient[line, 2] = w * (ax * bx + ay * by + az * bz)
+        hessian[line, 1, 1] = w * (cx * cx + cy * cy + cz * cz)
+        hessian[line, 2, 2] = w * (bx * bx + by * by + bz * bz)
+        hessian[line, 1, 2] = hessian[line, 2, 1] = -w * (bx * cx + by * cy + bz * cz)
+    return cost, gradient, hessian
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def crossed(a: Array, b: Array) -> tuple[float, float, float]:
+    """The product a x b."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -87,21 +129,33 @@ def add_crossed(c: Array, A: Array, out: Array) -> None:
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def world_forms(
-    centre: Array, rotation: Array, frame: Array, observation: Array, forms: Array
+    centre: Array,
+    rotation: Array,
+    frame: Array,
+    observation: Array,
+    segment_forms: Array,
+    event_forms: Array,
+    segment_weight: float,
+    event_weight: float,
 ) -> Array:
-    """(S, 6, 6) forms of lines about their own origins, in the world.
+    """(S, 6, 6) weighted sums of two forms, of lines about their own origins, in the world.
 
     Args:
         centre: (S, 3) camera centre of each row, m, world, about the origin of its line.
         rotation: (N, 3, 3) world from camera, of the frames.
         frame: (M,) of all observations.
         observation: (S,) of each row.
-        forms: (M, 6, 6) of all observations, camera frame.
+        segment_forms, event_forms: (M, 6, 6) of all observations, camera frame.
     """
     found = np.empty((len(observation), 6, 6))
-    half = np.empty((3, 3))
+    form, half = np.empty((6, 6)), np.empty((3, 3))
     for row in range(len(observation)):
-        R, form = rotation[frame[observation[row]]], forms[observation[row]]
+        k = observation[row]
+        R = rotation[frame[k]]
+        for i in range(6):
+            for j in range(6):
+                form[i, j] = segment_weight * segment_forms[k, i, j]
+                form[i, j] += event_weight * event_forms[k, i, j]
         c, vv, vm, mm = centre[row], found[row, :3, :3], found[row, :3, 3:], found[row, 3:, 3:]
         turned(R, form[:3, :3], half, vv)
         turned(R, form[:3, 3:], half, vm)

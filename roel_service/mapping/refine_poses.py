@@ -305,10 +305,10 @@ def _report(
     return PoseReport(
         line_count=sum(len(window.refined) for window in found),
         observation_count=observation_count,
-        iteration_count=sum(len(joint.costs) - 1 for joint in rounds),
+        iteration_count=sum(len(joint.costs) for joint in rounds),
         converged=all(window.last.converged for window in found),
         cost_initial=px2 * sum(window.rounds[0].costs[0] for window in found),
-        cost_final=px2 * sum(window.last.costs[-1] for window in found),
+        cost_final=px2 * sum(window.last.cost for window in found),
         time_offset_us=applied_us + left.offset_us,
         time_offset_sigma_us=left.sigma_us,
         problems=_problems(found, left, trajectory, config),
@@ -395,6 +395,7 @@ def _first_lines(detected: Detected, config: Config, run: MappingRun) -> Refined
             frames,
             replace(config.triangulate, max_residual_px=gate_px),
             np.random.default_rng(config.runtime.seed),
+            worker_count=worker_count(config),
         )
         loose = _with_gate(config, first_px)
         return run.without_diverged(
@@ -420,11 +421,11 @@ def _with_own_lines(
     workers = worker_count(config)
     refined = _first_lines(detected, config, run)
     drift = Drift.configured(config.refine)
+    frames, evidence = _seen_with(detected, correction)
     found: list[JointlyRefined] = []
     for gate_px in closing_gates(gates_px(config.refine, detected.frames.focal_px), found):
         gated = _with_gate(config, gate_px)
         with run.stage("match_global"):
-            frames, evidence = _seen_with(detected, correction)
             poses = correction.trajectory(smooth)
             refined = reassociate(
                 refined,

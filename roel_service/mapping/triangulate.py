@@ -16,6 +16,7 @@ from roel_service.config.stages import TriangulateConfig
 from roel_service.geometry import grassmann, plucker, projection, segments
 from roel_service.geometry.se3 import SE3
 from roel_service.geometry.vectors import dot
+from roel_service.in_order import in_order
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.views import Views, cuts_m, end_residuals_px
 from roel_service.scene.lines import InfiniteLines, LineTracks
@@ -58,12 +59,30 @@ class _Hypotheses:
     parent: IntArray
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _BestPairs:
+    """The best hypothesis of each track of a batch.
+
+    Attributes:
+        batch: (T,) indices of the tracks.
+        direction, moment: (T, 3) lines.
+        parent: (T,) observation that is the first of the pair, or `NO_PAIR`.
+    """
+
+    batch: IntArray
+    direction: FloatArray
+    moment: FloatArray
+    parent: IntArray
+
+
 def triangulate_tracks(
     tracks: LineTracks,
     views: Views,
     frames: Frames,
     config: TriangulateConfig,
     rng: np.random.Generator,
+    *,
+    worker_count: int = 1,
 ) -> Triangulated:
     """Triangulate every track that is long enough.
 
@@ -73,18 +92,24 @@ def triangulate_tracks(
         frames: calibration of the views.
         config: gates and numbers of trials.
         rng: draws the pairs.
+        worker_count: threads; the answer is the same with any.
     """
     direction = np.full((len(tracks), 3), np.nan)
     moment = np.full((len(tracks), 3), np.nan)
     parent = np.full(len(tracks), NO_PAIR)
-    for batch in _batches(tracks, config):
-        members, valid = _scored_members(tracks, batch, config.scored_observation_count)
-        hypotheses = _hypothesise(views.take(members), valid, config, rng)
-        best, tried = _best(hypotheses, views.take(members), valid, frames, config)
-        rows = np.arange(len(batch))
-        direction[batch] = hypotheses.direction[rows, best]
-        moment[batch] = hypotheses.moment[rows, best]
-        parent[batch] = np.where(tried, members[rows, hypotheses.parent[rows, best]], NO_PAIR)
+
+    def of_batch(drawn: tuple[IntArray, FloatArray]) -> _BestPairs:
+        return _best_pairs(tracks, views, frames, config, *drawn)
+
+    # Drawn here, one batch after the other, whichever thread needs them.
+    draws = (
+        (batch, rng.random((2, len(batch), config.pair_count)))
+        for batch in _batches(tracks, config)
+    )
+    for found in in_order(of_batch, draws, worker_count):
+        direction[found.batch] = found.direction
+        moment[found.batch] = found.moment
+        parent[found.batch] = found.parent
     inlier = np.zeros(len(tracks.observation), dtype=bool)
     rows = np.flatnonzero(parent[tracks.track_of_row] != NO_PAIR)
     track = tracks.track_of_row[rows]
@@ -110,6 +135,28 @@ def triangulate_tracks(
             observation=tracks.observation[kept],
         ),
         statuses=status.tolist(),
+    )
+
+
+def _best_pairs(
+    tracks: LineTracks,
+    views: Views,
+    frames: Frames,
+    config: TriangulateConfig,
+    batch: IntArray,
+    draws: FloatArray,
+) -> _BestPairs:
+    """The pair of views, among (2, T, H) random ones, whose line each of T tracks agrees with most."""
+    members, valid = _scored_members(tracks, batch, config.scored_observation_count)
+    scored = views.take(members)
+    hypotheses = _hypothesise(scored, valid, config, draws)
+    best, tried = _best(hypotheses, scored, valid, frames, config)
+    rows = np.arange(len(batch))
+    return _BestPairs(
+        batch=batch,
+        direction=hypotheses.direction[rows, best],
+        moment=hypotheses.moment[rows, best],
+        parent=np.where(tried, members[rows, hypotheses.parent[rows, best]], NO_PAIR),
     )
 
 
@@ -145,11 +192,10 @@ def _scored_members(
 
 
 def _hypothesise(
-    views: Views, valid: BoolArray, config: TriangulateConfig, rng: np.random.Generator
+    views: Views, valid: BoolArray, config: TriangulateConfig, draws: FloatArray
 ) -> _Hypotheses:
-    """Lines of random pairs of the (T, W) views."""
+    """Lines of pairs of the (T, W) views, by (2, T, H) draws from [0, 1)."""
     counts = valid.sum(axis=1)[:, None]
-    draws = rng.random((2, len(valid), config.pair_count))
     first = (draws[0] * counts).astype(np.intp)
     # The second view is any but the first.
     second = (first + 1 + (draws[1] * (counts - 1)).astype(np.intp)) % counts

@@ -5,7 +5,11 @@ from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker
 from roel_service.geometry.se3 import rotation_from_vector
 from roel_service.geometry.vectors import unit
-from roel_service.mapping.directions import common_directions, direction_prior
+from roel_service.mapping.directions import (
+    _uncertain_directions,
+    common_directions,
+    direction_prior,
+)
 from roel_service.mapping.refine import Refined, refine_lines
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
@@ -125,3 +129,15 @@ class TestPrior:
             np.testing.assert_allclose(cosine, 1.0, atol=1e-10)
         else:
             assert line_errors(found.lines, exact.segments).max() < 1e-6
+
+
+def test_densities_are_those_of_normal_distributions():
+    lines = lines_with(np.repeat(SHARED, 4, axis=0), across_deg=1.0, along_deg=5.0)
+    uncertain = _uncertain_directions(lines, CONFIG)
+    rng = np.random.default_rng(1)
+    asked = unit(np.concatenate([SHARED, SHARED + 0.05 * rng.normal(size=(3, 3)), -SHARED]))
+    squared = uncertain.squared_distance(asked)
+    expected = uncertain.peak * np.exp(-0.5 * squared)
+    assert np.isinf(squared).any()
+    assert (expected > 0.1 * uncertain.peak).any()
+    np.testing.assert_allclose(uncertain.density(asked), expected, rtol=1e-9, atol=1e-20)

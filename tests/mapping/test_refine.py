@@ -7,8 +7,14 @@ from hypothesis import strategies as st
 
 from roel_service.config.stages import RefineConfig
 from roel_service.geometry import plucker, projection, segments
-from roel_service.geometry.se3 import skew
-from roel_service.mapping.refine import OrthonormalLines, _Problem, refine_lines
+from roel_service.geometry.se3 import rotation_from_vector, skew
+from roel_service.mapping import refine
+from roel_service.mapping.refine import (
+    DirectionPrior,
+    OrthonormalLines,
+    _Problem,
+    refine_lines,
+)
 from roel_service.scene.lines import InfiniteLines, LineTracks
 
 from .synthetic import line_errors, perturbed, world
@@ -514,6 +520,48 @@ class TestDegenerate:
         np.testing.assert_array_equal(some.lines.moment, found.lines.moment[[4, 1]])
         np.testing.assert_array_equal(some.tracks[1], found.tracks[1])
         np.testing.assert_array_equal(some.information, found.information[[4, 1]])
+
+
+@COSTS
+def test_lines_that_rest_are_where_all_steps_bring_them(config, monkeypatch):
+    noisy = world(noise_px=0.3, event_noise_px=0.3)
+    config = dataclasses.replace(config, iteration_count=20)
+    start = perturbed(noisy.lines, angle_rad=0.01, offset_m=0.01)
+    resting = refined(noisy, start, config=config)
+    monkeypatch.setattr(refine, "RESTING_SHARE", -1.0)
+    moving = refined(noisy, start, config=config)
+    off = line_errors(resting.lines, noisy.segments)
+    assert np.median(off[:, 0]) > 1e-4
+    np.testing.assert_allclose(off, line_errors(moving.lines, noisy.segments), rtol=0.02, atol=1e-6)
+
+
+def test_a_direction_pulls_by_its_squared_sine():
+    rng = np.random.default_rng(0)
+    lines = world().lines
+    moment = plucker.shift_origin(lines.direction, lines.moment, np.zeros((len(lines), 3)))
+    U, phi = plucker.orthonormal_from_plucker(lines.direction, moment)
+    direction = rotation_from_vector(0.1 * rng.normal(size=(len(lines), 3))) @ U[:, :, :1]
+    prior = DirectionPrior(direction=direction[..., 0], weight=rng.uniform(1.0, 2.0, len(lines)))
+    sine = np.linalg.norm(np.cross(lines.direction, prior.direction), axis=1)
+    system = refine.direction_system(OrthonormalLines(U=U, phi=phi), prior)
+    np.testing.assert_allclose(system.cost, prior.weight * sine**2)
+    for k, step in enumerate(1e-6 * np.eye(4)):
+        both = [
+            refine.direction_cost(
+                OrthonormalLines(U=ahead, phi=later),
+                prior,
+            )
+            for ahead, later in (
+                plucker.retract_orthonormal(U, phi, np.tile(sign * step, (len(lines), 1)))
+                for sign in (1.0, -1.0)
+            )
+        ]
+        # The gradients are halves, as everywhere.
+        np.testing.assert_allclose(
+            system.gradient[:, k], (both[0] - both[1]) / 4e-6, atol=1e-9, rtol=1e-6
+        )
+    np.testing.assert_array_equal(system.hessian, np.swapaxes(system.hessian, 1, 2))
+    assert (np.linalg.eigvalsh(system.hessian) > -1e-12).all()
 
 
 @pytest.mark.parametrize("config", [PIXEL, dataclasses.replace(PIXEL, loss_scale_medians=2.0)])

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from roel_service.config.stages import TriangulateConfig
 from roel_service.geometry import plucker, segments
 from roel_service.geometry.se3 import SE3, rotation_from_vector
+from roel_service.mapping import triangulate
 from roel_service.mapping.triangulate import triangulate_tracks
 from roel_service.mapping.views import views_of
 from roel_service.scene.lines import LineTracks
@@ -259,3 +260,24 @@ def test_large_batches_are_cut_without_changing_what_is_found(monkeypatch):
     direction, moment = plucker.plucker_from_endpoints(exact.segments)
     sign = np.sign(np.vecdot(direction, parts.lines.direction))[:, None]
     np.testing.assert_allclose(sign * parts.lines.moment, moment, rtol=0, atol=1e-9)
+
+
+@GATES
+def test_lines_are_the_same_with_any_number_of_threads(config, monkeypatch):
+    exact = world()
+    views = views_of(exact.observations, exact.frames)
+    # Several batches, whose pairs are drawn from one generator.
+    monkeypatch.setattr(triangulate, "BATCH_SIZE", 2 * config.pair_count)
+    alone, together = (
+        triangulate_tracks(
+            exact.tracks,
+            views,
+            exact.frames,
+            config,
+            np.random.default_rng(3),
+            worker_count=count,
+        )
+        for count in (1, 3)
+    )
+    np.testing.assert_array_equal(alone.lines.moment, together.lines.moment)
+    np.testing.assert_array_equal(alone.tracks.observation, together.tracks.observation)
