@@ -46,8 +46,9 @@ FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
 LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
 UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
-# Fits in a slice of the work.
-SLICE_FIT_COUNT = 6
+# Poses are scored so many at a time, which takes about so long, as do fits to lines and to events.
+STEP_POSE_COUNT, STEP_MS = 1_200, 7.0
+LINE_FIT_MS, EVENT_FIT_MS = 7.0, 4.0
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0
@@ -60,7 +61,7 @@ def locating(
     eyes: Eyes,
     config: TrackConfig,
     rng: np.random.Generator,
-) -> Generator[None, None, list[WindowFit]]:
+) -> Generator[float, None, list[WindowFit]]:
     """States in the middle of a window, within the configured reach of a guess, the best first.
 
     Args:
@@ -70,21 +71,19 @@ def locating(
         rng: draws the poses that are tried.
 
     Yields:
-        Nothing, between slices of the work, of about the same length.
+        Before each step of the work, about how many ms it takes.
 
     Returns:
         Fits that lie apart, however poor; none where no line is seen.
     """
     poses = yield from _searching(guess, sight.lines, eyes, config, rng)
-    yield
     sampled = _sampled(sight.lines, window.t_us).thinned(SAMPLED_COUNT)
     starts = [
         roughly_at(pose, _turning(pose, sight.turn_rate), window.t_us, config) for pose in poses
     ]
-    on_lines = yield from _fitting(starts, sampled, eyes, config, LINE_SCALES_PX)
-    yield
+    on_lines = yield from _fitting(starts, sampled, eyes, config, LINE_SCALES_PX, LINE_FIT_MS)
     best = [fit.state for fit in on_lines]
-    return (yield from _fitting(best, window, eyes, config, UNSURE_SCALES_PX))
+    return (yield from _fitting(best, window, eyes, config, UNSURE_SCALES_PX, EVENT_FIT_MS))
 
 
 def _fitting(
@@ -93,12 +92,12 @@ def _fitting(
     eyes: Eyes,
     config: TrackConfig,
     scales_px: tuple[float, ...],
-) -> Generator[None, None, list[WindowFit]]:
-    """What is left of the starts, the best first, in slices of a few of them."""
+    fit_ms: float,
+) -> Generator[float, None, list[WindowFit]]:
+    """What is left of the starts, the best first."""
     fits: list[WindowFit] = []
-    for count, start in enumerate(starts):
-        if count and count % SLICE_FIT_COUNT == 0:
-            yield
+    for start in starts:
+        yield fit_ms
         fits.append(fit_window(start, window, eyes.pieces, eyes.view, config, scales_px))
     return distinct(sorted(fits, key=explained_count, reverse=True))
 
@@ -169,7 +168,7 @@ def _sampled(lines: FittedLines, t_us: int) -> Window:
 
 def _searching(
     guess: SE3, lines: FittedLines, eyes: Eyes, config: TrackConfig, rng: np.random.Generator
-) -> Generator[None, None, list[SE3]]:
+) -> Generator[float, None, list[SE3]]:
     """The most likely poses within reach of a guess, some apart from each other."""
     focal_px = float(np.sqrt(eyes.view.K[0, 0] * eyes.view.K[1, 1]))
     reach = np.array([np.deg2rad(config.reach_deg)] * 3 + [config.reach_m] * 3)
@@ -181,23 +180,27 @@ def _searching(
     spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
     for share in NEARNESS_SHARES:
         fields = _fields(lines.segments_px, share * focal_px, cell_px, eyes.view)
-        poses = guess.retract(tangents)
-        score = search_kernels.scores(
-            poses.rotation,
-            poses.translation,
-            points,
-            direction,
-            eyes.view.K,
-            fields,
-            fields.mean(axis=(1, 2), dtype=np.float64),
-            fields.var(axis=(1, 2), dtype=np.float64),
-            cell_px,
-            MIN_DEPTH_SHARE * eyes.pieces.extent_m,
-        )
-        tangents = tangents[np.argsort(-score, kind="stable")[:KEPT_COUNT]]
-        if share == NEARNESS_SHARES[0]:
-            # It takes as long as the others together.
-            yield
+        means = fields.mean(axis=(1, 2), dtype=np.float64)
+        variances = fields.var(axis=(1, 2), dtype=np.float64)
+        scores = []
+        for part in np.array_split(tangents, -(-len(tangents) // STEP_POSE_COUNT)):
+            yield STEP_MS
+            poses = guess.retract(part)
+            score = search_kernels.scores(
+                poses.rotation,
+                poses.translation,
+                points,
+                direction,
+                eyes.view.K,
+                fields,
+                means,
+                variances,
+                cell_px,
+                MIN_DEPTH_SHARE * eyes.pieces.extent_m,
+            )
+            scores.append(score)
+        best = np.argsort(-np.concatenate(scores), kind="stable")[:KEPT_COUNT]
+        tangents = tangents[best]
         if share != NEARNESS_SHARES[-1]:
             spread = 0.5 * spread
             noise = rng.normal(size=(len(tangents), CHILD_COUNT, 6)) * spread

@@ -22,9 +22,11 @@ from roel_service.tracking.pursuit import Pursuit
 from roel_service.tracking.sight import Eyes, looking
 from roel_service.tracking.verdict import is_possible
 
-# What it finds goes through windows until so many fits are done, in a slice; about so many events of
-# each are enough.
-SLICE_FIT_COUNT, EVENT_COUNT = 5, 3_000
+# A slice is as much as takes about so long, as the steps tell beforehand: the clock has no say, so that
+# the same events give the same poses.
+SLICE_MS = 28.0
+# What a fit in one of the windows that came meanwhile takes, of about so many events.
+FIT_MS, EVENT_COUNT = 7.0, 3_000
 
 
 class Search:
@@ -58,19 +60,24 @@ class Search:
         self.found: Pursuit | None = None
         self._waiting: deque[Window] = deque()
         self._eyes, self._config, self._rng = eyes, config, rng
-        self._slices = self._searching(place, turn_rate, window, around, before)
+        self._steps = self._searching(place, turn_rate, window, around, before)
+        # Of the next step.
+        self._ahead_ms = 0.0
 
     def see(self, window: Window) -> None:
         """Another window has come."""
         self._waiting.append(window.thinned(EVENT_COUNT))
 
     def go_on(self) -> None:
-        """Do the next slice."""
-        next(self._slices, None)
+        """Do the next slice: as many steps as fit, at least one."""
+        spent_ms = 0.0
+        while self.found is None and (spent_ms == 0.0 or spent_ms + self._ahead_ms <= SLICE_MS):
+            spent_ms += self._ahead_ms
+            self._ahead_ms = next(self._steps, 0.0)
 
     def finish(self) -> None:
         """Do all of them."""
-        for _ in self._slices:
+        for _ in self._steps:
             pass
 
     def _searching(
@@ -80,23 +87,18 @@ class Search:
         window: Window,
         around: EventStream,
         before: float,
-    ) -> Generator[None, None, None]:
+    ) -> Generator[float, None, None]:
         eyes, config, rng = self._eyes, self._config, self._rng
         sight = yield from looking(around, window.t_us, eyes, turn_rate)
-        yield
         fits = yield from locating(place, sight, window, eyes, config, rng)
         answers = [Follower(fit, before) for fit in fits if is_possible(fit, config)]
         pursuit = Pursuit(answers, eyes, config, rng)
         while self._waiting and not pursuit.is_over:
-            yield
-            self._catch_up(pursuit)
+            # Two, since one comes meanwhile.
+            yield 2.0 * FIT_MS * len(pursuit.followers)
+            for _ in range(2):
+                if self._waiting and not pursuit.is_over:
+                    pursuit.follow(self._waiting.popleft())
         for follower in pursuit.followers:
             follower.begin_anew()
         self.found = pursuit
-
-    def _catch_up(self, pursuit: Pursuit) -> None:
-        """Follow through some of the windows that wait: always more than come meanwhile."""
-        fit_count = 0
-        while self._waiting and not pursuit.is_over and fit_count < SLICE_FIT_COUNT:
-            fit_count += len(pursuit.followers)
-            pursuit.follow(self._waiting.popleft())

@@ -59,6 +59,10 @@ class Eyes:
     pieces: MapPieces
 
 
+# What the two steps of a sharp look take at 640x480, about.
+SEEDS_MS, PLANES_MS = 20.0, 16.0
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sight:
     """What the events around one moment show.
@@ -81,10 +85,11 @@ def glimpse(events: EventStream, t_us: int, eyes: Eyes) -> Sight:
 
 def looking(
     events: EventStream, t_us: int, eyes: Eyes, turn_rate: FloatArray
-) -> Generator[None, None, Sight]:
-    """Lines once a turn is undone, in two slices of the work."""
+) -> Generator[float, None, Sight]:
+    """Lines once a turn is undone; before each step, about how many ms it takes."""
+    yield SEEDS_MS
     seeds, frame = _seeds(events, t_us, eyes, turn_rate, SHARP_FRAMES, SHARP_DETECT)
-    yield
+    yield PLANES_MS
     lines = _planes(seeds, frame)
     undone_px_ms = 1e-3 * _speeds_by_turn(lines.segments_px, eyes.view) @ turn_rate
     lines = replace(lines, normal_speed_px_per_ms=lines.normal_speed_px_per_ms + undone_px_ms)
