@@ -170,16 +170,8 @@ def extended(buffer: EventStream | None, chunk: EventStream, *, keep_from_us: in
     """The events of a buffer from a time on, and those of the next chunk."""
     if buffer is None:
         return chunk
-    kept = buffer.between(keep_from_us, int(buffer.t_us[-1]) + 1)
-    tail = EventStream(
-        t_us=kept.t_us,
-        x=kept.x,
-        y=kept.y,
-        polarity=kept.polarity,
-        width=chunk.width,
-        height=chunk.height,
-    )
-    return concatenate([tail, chunk])
+    first = int(np.searchsorted(buffer.t_us, keep_from_us))
+    return concatenate([buffer.part(first, len(buffer)), chunk])
 
 
 def event_frame(

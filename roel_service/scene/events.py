@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -111,13 +111,11 @@ class EventStream:
 
     def part(self, start: int, stop: int) -> EventStream:
         """Events start <= index < stop as a stream, without a copy."""
-        part: EventStream = object.__new__(EventStream)
-        # Not by the constructor, which would check again what is known: that costs an upload a tenth.
-        for name in ("t_us", "x", "y", "polarity"):
-            object.__setattr__(part, name, getattr(self, name)[start:stop])
-        object.__setattr__(part, "width", self.width)
-        object.__setattr__(part, "height", self.height)
-        return part
+        columns = [column[start:stop] for column in self._columns()]
+        return _known(columns, self.width, self.height)
+
+    def _columns(self) -> tuple[IntArray, Array, Array, Array]:
+        return self.t_us, self.x, self.y, self.polarity
 
     def slice(self, start: int, stop: int, t_ref_us: int) -> EventSlice:
         """Events start <= index < stop, without a copy."""
@@ -164,15 +162,38 @@ class EventSource(Protocol):
 
 
 def concatenate(chunks: list[EventStream]) -> EventStream:
-    """One stream from chunks in the order of time; raises `EventsError` if they are not."""
-    return EventStream(
-        t_us=np.concatenate([chunk.t_us for chunk in chunks]),
-        x=np.concatenate([chunk.x for chunk in chunks]),
-        y=np.concatenate([chunk.y for chunk in chunks]),
-        polarity=np.concatenate([chunk.polarity for chunk in chunks]),
-        width=chunks[0].width,
-        height=chunks[0].height,
-    )
+    """One stream from chunks of one sensor in the order of time.
+
+    Raises:
+        EventsError: EVENT_TIME_NOT_MONOTONE for a chunk that begins before the one before it ends,
+            SENSOR_MISMATCH for one of another size.
+    """
+    width, height = chunks[0].width, chunks[0].height
+    index, last_us = 0, -(1 << 63)
+    for chunk in chunks:
+        if (chunk.width, chunk.height) != (width, height):
+            expected, found = f"a sensor of {width}x{height}", f"{chunk.width}x{chunk.height}"
+            raise EventsError("events", expected, found, reason="SENSOR_MISMATCH")
+        if len(chunk) and chunk.t_us[0] < last_us:
+            raise time_not_monotone(index, "events")
+        index, last_us = index + len(chunk), chunk.t_us[-1] if len(chunk) else last_us
+    columns = [np.concatenate(parts) for parts in zip(*(c._columns() for c in chunks), strict=True)]
+    for column in columns:
+        column.flags.writeable = False
+    return _known(columns, width, height)
+
+
+def _known(columns: Sequence[Array], width: int, height: int) -> EventStream:
+    """A stream of columns that are known to be right.
+
+    Not by the constructor, which would check again what is known: that costs an upload a tenth.
+    """
+    stream: EventStream = object.__new__(EventStream)
+    for name, column in zip(("t_us", "x", "y", "polarity"), columns, strict=True):
+        object.__setattr__(stream, name, column)
+    object.__setattr__(stream, "width", width)
+    object.__setattr__(stream, "height", height)
+    return stream
 
 
 def time_not_monotone(index: int, subject: str) -> EventsError:

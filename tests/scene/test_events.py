@@ -139,3 +139,24 @@ def test_concatenating_chunks_gives_the_stream_back(t_us, cut):
 def test_chunks_out_of_order_are_refused():
     with pytest.raises(EventsError, match="a decrease at event 2"):
         concatenate([stream([10, 11]), stream([9])])
+
+
+def test_chunks_after_an_empty_one_are_in_order_too():
+    with pytest.raises(EventsError, match="a decrease at event 2"):
+        concatenate([stream([10, 11]), stream([]), stream([9])])
+
+
+def test_chunks_of_another_sensor_are_refused():
+    events = stream([1])
+    wider = EventStream(
+        t_us=[2], x=[0], y=[0], polarity=[1], width=events.width + 1, height=events.height
+    )
+    with pytest.raises(EventsError, match=f"a sensor of {events.width}x{events.height}") as refusal:
+        concatenate([events, wider])
+    assert refusal.value.reason == "SENSOR_MISMATCH"
+
+
+def test_concatenated_columns_are_read_only():
+    joined = concatenate([stream([1]), stream([2])])
+    with pytest.raises(ValueError, match="read-only"):
+        joined.t_us[0] = 5
