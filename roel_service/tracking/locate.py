@@ -46,9 +46,10 @@ FAR = 1e4
 # Scales of the fits, px: to the lines that are seen, then to events.
 LINE_SCALES_PX, EVENT_SCALES_PX = (6.0, 3.0, 1.5), (2.0, 1.0)
 UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
-# Poses are scored so many at a time, which takes about so long, as do fits to lines and to events.
-STEP_POSE_COUNT, STEP_MS = 1_200, 7.0
-LINE_FIT_MS, EVENT_FIT_MS = 7.0, 4.0
+# What the fields of a round take, about, scores of so many poses, and fits to lines and to events.
+FIELDS_MS = 6.0
+STEP_POSE_COUNT, STEP_MS = 1_200, 6.0
+LINE_FIT_MS, EVENT_FIT_MS = 7.5, 10.0
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0
@@ -179,6 +180,7 @@ def _searching(
     tangents = _grid() * reach
     spread = np.array([TURN_STEP] * 3 + [SHIFT_STEP] * 3) * reach
     for share in NEARNESS_SHARES:
+        yield FIELDS_MS
         fields = _fields(lines.segments_px, share * focal_px, cell_px, eyes.view)
         means = fields.mean(axis=(1, 2), dtype=np.float64)
         variances = fields.var(axis=(1, 2), dtype=np.float64)

@@ -27,14 +27,17 @@ from roel_service.scene.trajectory import Trajectory
 from roel_service.tracking.fit import View
 from roel_service.tracking.pieces import MapPieces
 
-# While nothing undoes the motion: one window, and a short one.
-BLURRED_FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=1_500)
+# One window, a short one while nothing undoes the motion. However fast the camera moves, it has no
+# more events than that.
+MIN_HALF_WINDOW_US = 1_500
+BLURRED_FRAMES = FramesConfig(compensate_rotation=False, min_half_window_us=MIN_HALF_WINDOW_US)
+SHARP_FRAMES = FramesConfig(min_half_window_us=MIN_HALF_WINDOW_US)
 BLURRED_DETECT = DetectConfig(window_events_per_pixel=(0.1,))
-SHARP_FRAMES, SHARP_DETECT = FramesConfig(), DetectConfig(window_events_per_pixel=(0.2,))
+SHARP_DETECT = DetectConfig(window_events_per_pixel=(0.2,))
 # Nobody asks for the events of a line: the fewest are gathered.
 PLANES = PlaneFitConfig(support_event_count=1, support_half_window_us=1)
-# So many lines are enough to tell a place, and planes are fitted to no more.
-MAX_LINE_COUNT = 100
+# So many lines are enough to tell a turn, and a place: planes are fitted to no more.
+TURN_LINE_COUNT, PLACE_LINE_COUNT = 40, 100
 # A turn is taken to be even for so long around a moment.
 EVEN_US = 100_000
 # Speeds of lines are known about so well; a camera turns about so fast.
@@ -60,7 +63,7 @@ class Eyes:
 
 
 # What the two steps of a sharp look take at 640x480, about.
-SEEDS_MS, PLANES_MS = 20.0, 16.0
+SEEDS_MS, PLANES_MS = 19.0, 18.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,7 +82,7 @@ class Sight:
 def glimpse(events: EventStream, t_us: int, eyes: Eyes) -> Sight:
     """Lines as they are in the events, and the turn that they tell."""
     seeds, frame = _seeds(events, t_us, eyes, np.zeros(3), BLURRED_FRAMES, BLURRED_DETECT)
-    lines = _planes(seeds, frame)
+    lines = _planes(seeds, frame, TURN_LINE_COUNT)
     return Sight(lines=lines, turn_rate=_turn_rate(lines, eyes.view))
 
 
@@ -90,7 +93,7 @@ def looking(
     yield SEEDS_MS
     seeds, frame = _seeds(events, t_us, eyes, turn_rate, SHARP_FRAMES, SHARP_DETECT)
     yield PLANES_MS
-    lines = _planes(seeds, frame)
+    lines = _planes(seeds, frame, PLACE_LINE_COUNT)
     undone_px_ms = 1e-3 * _speeds_by_turn(lines.segments_px, eyes.view) @ turn_rate
     lines = replace(lines, normal_speed_px_per_ms=lines.normal_speed_px_per_ms + undone_px_ms)
     return Sight(lines=lines, turn_rate=turn_rate)
@@ -107,15 +110,15 @@ def _seeds(
     frame = event_frame(
         events, t_us, eyes.ideal_px, _turning(t_us, turn_rate), eyes.camera, frames, detect
     )
-    seeds = detect_lines(event_images(frame, detect), EDLines(detect), detect)
+    return detect_lines(event_images(frame, detect), EDLines(detect), detect), frame
+
+
+def _planes(seeds: Seeds, frame: EventFrame, most: int) -> FittedLines:
+    """The longest lines, with their planes."""
     # The longest come first.
-    longest = slice(0, MAX_LINE_COUNT)
-    return Seeds(segments_px=seeds.segments_px[longest], polarity=seeds.polarity[longest]), frame
-
-
-def _planes(seeds: Seeds, frame: EventFrame) -> FittedLines:
+    longest = Seeds(segments_px=seeds.segments_px[:most], polarity=seeds.polarity[:most])
     # The planes are voted for: nothing is drawn.
-    return fit_space_time_planes(seeds, frame, PLANES, np.random.default_rng(0))
+    return fit_space_time_planes(longest, frame, PLANES, np.random.default_rng(0))
 
 
 def _turning(t_us: int, turn_rate: FloatArray) -> Trajectory:

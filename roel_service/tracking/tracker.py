@@ -12,9 +12,8 @@ from roel_service.config.stages import TrackConfig
 from roel_service.errors import EventsError
 from roel_service.geometry.projection import undistortion_table
 from roel_service.geometry.se3 import SE3
-from roel_service.mapping.frames import extended
 from roel_service.scene.camera import Camera
-from roel_service.scene.events import EventStream, time_not_monotone
+from roel_service.scene.events import EventStream, concatenate, time_not_monotone
 from roel_service.scene.lines import LineMap
 from roel_service.scene.results import PoseStatus, TrackedPose
 from roel_service.tracking.fit import View, Window, WindowFit, window_of
@@ -32,8 +31,8 @@ FINDING_HALF_US = 25_000
 FINDING_AT_ONCE, EARLY_COUNT, EARLY_STRIDE, FINDING_STRIDE = 2, 16, 4, 10
 # So many searches wait for each other.
 MAX_SEARCH_COUNT = 4
-# Its turn is looked at in every so many.
-GLIMPSE_STRIDE = 2
+# Events are kept in so many pieces.
+MAX_PIECE_COUNT = 64
 # Without events for so long, the camera may be anywhere within reach.
 MAX_SILENCE_US = 500_000
 
@@ -80,10 +79,9 @@ class PoseTracker:
         )
         self._rng = np.random.default_rng(seed)
         self._beside = ThreadPoolExecutor(max_workers=1, thread_name_prefix="search")
-        self._buffer: EventStream | None = None
+        # Events in the order of time, in pieces as they came.
+        self._recent: list[EventStream] = []
         self._next_us = 0
-        # Of the camera, rad/s in its own axes.
-        self._turn_rate = np.zeros(3)
         self._pursuit = Pursuit([], self._eyes, config, self._rng)
         # The first one goes on, in a slice that has begun.
         self._searches: list[Search] = []
@@ -115,29 +113,39 @@ class PoseTracker:
         return poses
 
     def _advanced(self, events: EventStream) -> list[TrackedPose]:
-        buffer = self._buffer = self._extended(events)
+        self._receive(events)
         poses = []
-        while buffer.t_us[-1] >= self._next_us + self._reach_us():
-            poses.append(self._pose(buffer))
+        while events.t_us[-1] >= self._next_us + self._reach_us():
+            poses.append(self._pose(self._needed()))
         return poses
 
-    def _extended(self, events: EventStream) -> EventStream:
-        """The events that are still needed, and the next ones."""
+    def _receive(self, events: EventStream) -> None:
+        """Keep the next events."""
         camera = self._eyes.camera
         if (events.width, events.height) != (camera.width, camera.height):
             expected = f"a sensor of {camera.width}x{camera.height} as in the calibration"
             found = f"{events.width}x{events.height}"
             raise EventsError("events", expected, found, reason="SENSOR_MISMATCH")
         first_us = int(events.t_us[0])
-        if self._buffer is None:
+        if not self._recent:
             self._next_us = first_us + self._reach_us()
-        elif first_us < self._buffer.t_us[-1]:
+        elif first_us < self._recent[-1].t_us[-1]:
             raise time_not_monotone(0, "events")
         elif first_us > self._next_us + MAX_SILENCE_US:
             self._lose()
             self._next_us = first_us + self._reach_us()
+        self._recent.append(events)
+        if len(self._recent) > MAX_PIECE_COUNT:
+            self._needed()
+
+    def _needed(self) -> EventStream:
+        """The events that are still needed, in one piece."""
         keep_from_us = self._next_us - max(self._config.interval_us, FINDING_HALF_US)
-        return extended(self._buffer, events, keep_from_us=keep_from_us)
+        # One piece may be a whole recording.
+        events = concatenate(self._recent) if len(self._recent) > 1 else self._recent[0]
+        first = np.searchsorted(events.t_us, keep_from_us)
+        self._recent = [events.part(min(int(first), len(events) - 1), len(events))]
+        return self._recent[0]
 
     def _reach_us(self) -> int:
         """Time after the next pose of which events are needed."""
@@ -212,13 +220,11 @@ class PoseTracker:
         """See how a lost camera turns, and look for it now and then."""
         self._whereabouts.lost(window.t_us)
         attempt, self._lost_count = self._lost_count, self._lost_count + 1
-        is_searched = _is_searched(attempt) and len(self._searches) < MAX_SEARCH_COUNT
-        if attempt % GLIMPSE_STRIDE == 0 or is_searched:
-            self._turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
-        if is_searched:
+        turn_rate = glimpse(around, window.t_us, self._eyes).turn_rate
+        if _is_searched(attempt) and len(self._searches) < MAX_SEARCH_COUNT:
             place = self._whereabouts.place(window.t_us, attempt, self._rng)
-            self._search(place, self._turn_rate, window, around)
-        self._whereabouts.turned(self._turn_rate, window.span_s)
+            self._search(place, turn_rate, window, around)
+        self._whereabouts.turned(turn_rate, window.span_s)
 
     def _search(
         self,

@@ -26,7 +26,10 @@ def slices_of(steps_ms):
 @pytest.mark.parametrize(
     ("steps_ms", "slices"),
     [
-        ([20.0, 16.0, 7.0, 7.0, 4.0], [[20.0], [16.0, 7.0], [7.0, 4.0]]),
+        (
+            [SLICE_MS * share for share in (0.7, 0.5, 0.25, 0.25, 0.1)],
+            [[SLICE_MS * share for share in part] for part in ([0.7], [0.5, 0.25, 0.25], [0.1])],
+        ),
         # What is longer than a slice is one.
         ([5.0, 2.0 * SLICE_MS, 5.0], [[5.0], [2.0 * SLICE_MS], [5.0]]),
         ([SLICE_MS / 4] * 6, [[SLICE_MS / 4] * 4, [SLICE_MS / 4] * 2]),

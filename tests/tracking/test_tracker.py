@@ -38,7 +38,7 @@ def errors(room, poses):
 
 @pytest.fixture(scope="module")
 def room():
-    return recording()
+    return recording(seconds=1.2)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def followed(room):
 def test_poses_come_at_every_interval(followed):
     times = np.array([pose.t_us for pose in followed])
     assert (np.diff(times) == CONFIG.interval_us).all()
-    assert len(times) == 39
+    assert len(times) == 47
 
 
 def test_the_camera_is_looked_for_then_followed(room, followed):
@@ -89,10 +89,12 @@ def test_errors_go_with_the_covariances(room, followed):
     assert np.mean(distances) < 12.0
 
 
-def test_chunks_of_any_size_give_the_same_poses(room, followed):
+# The last ones are so many that they are joined while no pose is due.
+@pytest.mark.parametrize("chunk_us", [7_919, 1_000_000, 313])
+def test_chunks_of_any_size_give_the_same_poses(room, followed, chunk_us):
     first = room.pose(25_000).retract(off(1))
     tracker = PoseTracker(room.line_map, CAMERA, CONFIG, first)
-    again = tracked(room, tracker, room.chunks(7_919))
+    again = tracked(room, tracker, room.chunks(chunk_us))
     assert [pose.status for pose in again] == [pose.status for pose in followed]
     for one, other in zip(again, followed, strict=True):
         if one.T_world_camera is not None:
@@ -101,8 +103,8 @@ def test_chunks_of_any_size_give_the_same_poses(room, followed):
             )
 
 
-def test_a_camera_at_rest_keeps_its_pose(halfway):
-    tracker, _, rest = halfway
+def test_a_camera_at_rest_keeps_its_pose(underway):
+    tracker, _, rest = underway
     first_us = int(rest.t_us[0])
     # Some noise, and no motion.
     rng = np.random.default_rng(2)
@@ -142,8 +144,8 @@ def moved(events, *, later_us=0, is_turned=False):
 
 
 @pytest.fixture
-def halfway(room):
-    """A tracker that has followed half of the recording, its last pose, and the other half."""
+def underway(room):
+    """A tracker that follows a camera, its last pose, and events in which two searches fit."""
     tracker = PoseTracker(room.line_map, CAMERA, CONFIG, room.pose(25_000))
     cut = int(np.searchsorted(room.events.t_us, 480_000))
     pose = tracker.push(room.events.part(0, cut))[-1]
@@ -151,16 +153,16 @@ def halfway(room):
     return tracker, pose, room.events.part(cut, len(room.events))
 
 
-def test_a_camera_that_jumps_is_lost_at_once(halfway):
-    tracker, _, rest = halfway
+def test_a_camera_that_jumps_is_lost_at_once(underway):
+    tracker, _, rest = underway
     after = tracker.push(moved(rest, is_turned=True))
     # The first interval holds events of before.
     assert PoseStatus.TRACKING not in {pose.status for pose in after[1:]}
     assert after[-1].status is PoseStatus.LOST
 
 
-def test_a_hint_leads_to_where_the_camera_is_now(room, halfway):
-    tracker, _, rest = halfway
+def test_a_hint_leads_to_where_the_camera_is_now(room, underway):
+    tracker, _, rest = underway
     now = room.pose(int(rest.t_us[0]))
     upside_down = rotation_from_vector(np.array([0.0, 0.0, np.pi]))
     tracker.guess(SE3(rotation=now.rotation @ upside_down, translation=now.translation))
@@ -170,8 +172,8 @@ def test_a_hint_leads_to_where_the_camera_is_now(room, halfway):
     )
 
 
-def test_a_silence_makes_the_tracker_look_again(halfway):
-    tracker, pose, rest = halfway
+def test_a_silence_makes_the_tracker_look_again(underway):
+    tracker, pose, rest = underway
     after = tracker.push(moved(rest, later_us=2 * MAX_SILENCE_US))
     assert after[0].status is PoseStatus.LOST
     assert after[0].t_us > pose.t_us + MAX_SILENCE_US
