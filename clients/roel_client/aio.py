@@ -220,7 +220,8 @@ class AsyncClient:
         Args:
             map_version: a map that stays as it is; None refines lines and poses together.
             estimate_time_offset: the clock of the poses may run beside that of the events.
-            estimate_intrinsics: the focal length may be off; takes some six times as long.
+            estimate_intrinsics: focal length and principal point may be off; takes
+                fourteen times as long, or up to three times that if they are.
         """
         async with self.hosted_recording(events, trajectory, camera, progress) as stream:
             operation = await self.refine_poses(
@@ -372,7 +373,8 @@ class AsyncClient:
             map_version: a map that stays as it is; None refines lines and poses together.
             target_map: a map that gets a version of the lines seen from the refined poses.
             estimate_time_offset: the clock of the poses may run beside that of the events.
-            estimate_intrinsics: the focal length may be off; takes some six times as long.
+            estimate_intrinsics: focal length and principal point may be off; takes
+                fourteen times as long, or up to three times that if they are.
         """
         request = maps_pb2.RefinePosesRequest(
             event_stream=stream,

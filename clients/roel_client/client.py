@@ -217,7 +217,8 @@ class Client:
         Args:
             map_version: a map that stays as it is; None refines lines and poses together.
             estimate_time_offset: the clock of the poses may run beside that of the events.
-            estimate_intrinsics: the focal length may be off; takes some six times as long.
+            estimate_intrinsics: focal length and principal point may be off; takes
+                fourteen times as long, or up to three times that if they are.
         """
         with self.hosted_recording(events, trajectory, camera, progress) as stream:
             operation = self.refine_poses(
@@ -365,7 +366,8 @@ class Client:
             map_version: a map that stays as it is; None refines lines and poses together.
             target_map: a map that gets a version of the lines seen from the refined poses.
             estimate_time_offset: the clock of the poses may run beside that of the events.
-            estimate_intrinsics: the focal length may be off; takes some six times as long.
+            estimate_intrinsics: focal length and principal point may be off; takes
+                fourteen times as long, or up to three times that if they are.
         """
         request = maps_pb2.RefinePosesRequest(
             event_stream=stream,

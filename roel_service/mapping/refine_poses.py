@@ -20,12 +20,12 @@ from roel_service.config.stages import Config, RefineConfig, RefineRoundsConfig
 from roel_service.geometry import plucker
 from roel_service.geometry.alignment import align_poses, as_large_as
 from roel_service.geometry.se3 import SE3
+from roel_service.mapping import intrinsics_search
 from roel_service.mapping.batch_poses import refine_poses_at_once
 from roel_service.mapping.detect import line_detector
 from roel_service.mapping.directions import direction_prior
 from roel_service.mapping.evidence import Evidence
 from roel_service.mapping.first_lines import check_line_count
-from roel_service.mapping.focal_search import MAX_COST_COUNT, estimate_focal, with_focal
 from roel_service.mapping.frames import Frames
 from roel_service.mapping.front_end import Detected, lines_of_all_frames, worker_count
 from roel_service.mapping.joint import FEIGNED_DRIFT, JointlyRefined, refine_jointly
@@ -46,7 +46,7 @@ from roel_service.scene.events import EventSource
 from roel_service.scene.lines import InfiniteLines, LineMap
 from roel_service.scene.results import (
     MAPPING_STAGES,
-    FocalEstimate,
+    IntrinsicsEstimate,
     PoseProblem,
     PoseReport,
     PoseResult,
@@ -71,8 +71,10 @@ FULL_WEIGHT_SHARE = 0.1
 # A time offset that is smaller, or less sure, is none; and it is estimated so many times at the most.
 LEAST_OFFSET_US, OFFSET_SIGMA_COUNT = 4_000.0, 4.0
 MAX_OFFSET_COUNT = 3
-# Of the time, if a focal length is looked for.
-FOCAL_SHARE = 0.8
+# Of the time, if what is wrong with the calibration is looked for.
+INTRINSICS_SHARE = 0.9
+# So many refinements tell that a calibration is right.
+USUAL_COST_COUNT = 13
 # A focal length that is off by a smaller share is not told: noisy poses alone may feign .7 %.
 LEAST_FOCAL_SHARE = 0.015
 # A drift that is learned to be so many times larger than expected is none of an odometry.
@@ -132,8 +134,8 @@ def refine_poses(
     as large as they are.
 
     Args:
-        events: read front to back, again for every estimate of the time offset, and for every focal
-            length that is tried.
+        events: read front to back, again for every estimate of the time offset, and for every
+            calibration that is tried.
         trajectory: poses on the clock of the events.
         camera: calibration of the sensor.
         config: parameters of every stage; those of the poses are in `refine`.
@@ -141,8 +143,8 @@ def refine_poses(
             finds poses there is the smooth correction, whichever method is configured.
         estimate_time_offset: whether the clock of the poses may run beside that of the events; the
             result is on the latter, at the times that were given.
-        estimate_intrinsics: whether the focal length may be off. It is looked for with the given
-            clock, by some six refinements.
+        estimate_intrinsics: whether focal length and principal point may be off. They are looked for
+            with the given clock, by some fourteen refinements, or twice or three times as many if they are.
         progress: called often; may raise `Cancelled`.
 
     Raises:
@@ -158,13 +160,12 @@ def refine_poses(
             config.refine.require_more_than_poses()
         return refine_poses_at_once(events, trajectory, camera, config, progress)
     seconds = dict.fromkeys(MAPPING_STAGES, 0.0)
-    focal = None
+    intrinsics = None
     if estimate_intrinsics:
-        searching, progress = (
-            part_of(progress, *share) for share in ((0.0, FOCAL_SHARE), (FOCAL_SHARE, 1.0))
-        )
-        focal = _focal(events, trajectory, camera, config, line_map, seconds, searching)
-        camera = with_focal(camera, focal.scale) if focal.is_applied else camera
+        searching = part_of(progress, 0.0, INTRINSICS_SHARE)
+        progress = part_of(progress, INTRINSICS_SHARE, 1.0)
+        intrinsics = _intrinsics(events, trajectory, camera, config, line_map, seconds, searching)
+        camera = intrinsics.camera
     applied_us = 0
     count = MAX_OFFSET_COUNT if estimate_time_offset else 1
     for index in range(count):
@@ -177,7 +178,9 @@ def refine_poses(
         if index + 1 == count or not left.exceeds(LEAST_OFFSET_US, OFFSET_SIGMA_COUNT):
             break
         applied_us += round(left.offset_us)
-    report = replace(_report(found, left, trajectory, config, applied_us, seconds), focal=focal)
+    report = replace(
+        _report(found, left, trajectory, config, applied_us, seconds), intrinsics=intrinsics
+    )
     for problem in report.problems:
         logger.warning("poses: %s", PROBLEMS[problem])
     poses, covariance = laid_over(
@@ -203,7 +206,7 @@ def in_likeliest_world(refined: Trajectory, given: Trajectory, config: RefineCon
     return Trajectory(t_us=refined.t_us, T_world_camera=T_world_refined @ poses)
 
 
-def _focal(
+def _intrinsics(
     events: EventSource,
     trajectory: Trajectory,
     camera: Camera,
@@ -211,19 +214,18 @@ def _focal(
     line_map: LineMap | None,
     seconds: dict[str, float],
     progress: ProgressCallback,
-) -> FocalEstimate:
-    """The focal length with which a recording is refined best."""
-    tried = itertools.count()
+) -> IntrinsicsEstimate:
+    """The calibration with which a recording is refined best."""
+    tried = itertools.pairwise(itertools.count())
 
-    def cost(scale: float) -> float:
-        index = next(tried)
-        share = part_of(progress, index / MAX_COST_COUNT, (index + 1) / MAX_COST_COUNT)
-        run = MappingRun(share, seconds=seconds)
-        other = with_focal(camera, scale)
+    def cost(other: Camera) -> float:
+        # Nobody knows how many there will be.
+        begin, end = (index / (index + USUAL_COST_COUNT) for index in next(tried))
+        run = MappingRun(part_of(progress, begin, end), seconds=seconds)
         found = _found(events, trajectory, other, config, line_map, run)
         return sum(window.last.robust_cost for window in found)
 
-    return estimate_focal(cost)
+    return intrinsics_search.estimate_intrinsics(camera, cost)
 
 
 def _found(

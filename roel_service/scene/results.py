@@ -9,6 +9,7 @@ import numpy as np
 
 from roel_service.arrays import FloatArray, frozen_array
 from roel_service.geometry.se3 import SE3
+from roel_service.scene.camera import Camera
 from roel_service.scene.lines import LineMap
 from roel_service.scene.trajectory import Trajectory
 
@@ -155,18 +156,34 @@ class PoseProblem(Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FocalEstimate:
-    """How far off a given focal length is.
+class CalibrationError:
+    """How far off one number of a calibration is.
 
     Attributes:
-        scale: what it has to be multiplied by.
-        sigma: standard deviation of `scale`; infinite where nothing tells.
-        is_applied: the results are of the estimated focal length, not of the given one.
+        change: what has to be added to it, px, or to 1 for what a focal length is multiplied by.
+        sigma: standard deviation of `change`; infinite where nothing tells.
+        is_applied: the results are of the mended number, not of the given one.
     """
 
-    scale: float
+    change: float
     sigma: float
     is_applied: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class IntrinsicsEstimate:
+    """How far off a calibration is.
+
+    Attributes:
+        focal: of both focal lengths alike.
+        principal_x, principal_y: of the principal point.
+        camera: the given calibration with what is applied.
+    """
+
+    focal: CalibrationError
+    principal_x: CalibrationError
+    principal_y: CalibrationError
+    camera: Camera
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -182,7 +199,7 @@ class PoseReport:
             first and after the last step.
         time_offset_us, time_offset_sigma_us: what has to be added to the times of the given poses,
             and its standard deviation; infinite where nothing tells.
-        focal: how far off the given focal length is; none where that was not asked for.
+        intrinsics: how far off the given calibration is; none where that was not asked for.
         problems: what a caller should look at before the poses are used.
         seconds: wall-clock time of each stage.
     """
@@ -195,7 +212,7 @@ class PoseReport:
     cost_final: float
     time_offset_us: float
     time_offset_sigma_us: float
-    focal: FocalEstimate | None = None
+    intrinsics: IntrinsicsEstimate | None = None
     problems: tuple[PoseProblem, ...]
     seconds: dict[str, float]
 

@@ -36,6 +36,12 @@ KEYS = [
     "focal_scale",
     "focal_scale_sigma",
     "focal_is_applied",
+    "principal_x_shift_px",
+    "principal_x_sigma_px",
+    "principal_x_is_applied",
+    "principal_y_shift_px",
+    "principal_y_sigma_px",
+    "principal_y_is_applied",
     "problems",
     "seconds",
 ]

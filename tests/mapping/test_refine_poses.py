@@ -9,7 +9,7 @@ from roel_service.errors import Cancelled, NoAnswerError
 from roel_service.evaluation.poses import trajectory_errors, translation_errors_m
 from roel_service.geometry.alignment import align_points
 from roel_service.mapping import pose_windows
-from roel_service.mapping.focal_search import with_focal
+from roel_service.mapping.intrinsics_search import with_focal
 from roel_service.mapping.joint import FEIGNED_DRIFT
 from roel_service.mapping.pipeline import build_line_map
 from roel_service.mapping.refine_poses import (
@@ -133,12 +133,15 @@ class TestAClockThatIsOff:
 
 
 @pytest.mark.slow
-def test_a_focal_length_that_is_too_long_is_found():
-    longer = with_focal(CAMERA, 1.03)
-    found = refine_poses(event_stream(), trajectory(), longer, CONFIG, estimate_intrinsics=True)
-    focal = found.report.focal
-    assert focal.is_applied
-    assert abs(1.03 * focal.scale - 1.0) < 3.0 * focal.sigma
+def test_a_focal_length_that_is_too_short_is_found():
+    shorter = with_focal(CAMERA, -0.03)
+    found = refine_poses(event_stream(), trajectory(), shorter, CONFIG, estimate_intrinsics=True)
+    intrinsics = found.report.intrinsics
+    assert intrinsics.focal.is_applied
+    assert abs(0.97 * (1.0 + intrinsics.focal.change) - 1.0) < 3.0 * intrinsics.focal.sigma
+    # Twelve lines hardly tell the principal point, and say so.
+    for error in (intrinsics.principal_x, intrinsics.principal_y):
+        assert abs(error.change) < 3.0 * error.sigma
     assert trajectory_errors(found.trajectory, trajectory()).ate_rmse_m < 0.005
 
 

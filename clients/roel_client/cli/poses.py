@@ -38,7 +38,8 @@ def add_commands(subparsers: Subparsers) -> None:
     parser.add_argument(
         "--estimate-intrinsics",
         action="store_true",
-        help="the focal length may be off, by up to 4 %%; some six times as long",
+        help="focal length and principal point may be off, by up to 4 %% of the former; "
+        "takes fourteen times as long, or up to three times that if they are",
     )
     parser.add_argument(
         "--plot",
@@ -92,12 +93,17 @@ def refine_poses(options: argparse.Namespace, staged: Staged) -> None:
 
 
 def _told(result: dict[str, Any], out: str) -> str:
-    focal = ""
+    mended = ""
     if result["focal_is_applied"]:
-        focal = f"; focal length times {result['focal_scale']:.4f}"
+        mended += f"; focal length times {result['focal_scale']:.4f}"
+    for axis in ("x", "y"):
+        if result[f"principal_{axis}_is_applied"]:
+            mended += (
+                f"; principal point {result[f'principal_{axis}_shift_px']:+.1f} px along {axis}"
+            )
     problems = "".join(f"; {problem}" for problem in result["problems"])
     return (
         f"{out}: {result['pose_count']} poses moved by {1e3 * result['mean_shift_m']:.1f} mm and "
         f"{result['mean_turn_deg']:.2f} degrees in the mean, held by {result['line_count']} lines; "
-        f"{result['seconds']:.1f} s{focal}{problems}"
+        f"{result['seconds']:.1f} s{mended}{problems}"
     )

@@ -42,7 +42,7 @@ def refine_poses(
     started_s = time.perf_counter()
     line_map = None if map_name is None else read_map(map_name)
     with naming(recording.names):
-        trajectory, report = refinement.refine_poses(
+        found, report = refinement.refine_poses(
             recording.events,
             recording.trajectory,
             recording.camera,
@@ -52,8 +52,8 @@ def refine_poses(
             estimate_intrinsics=estimate_intrinsics,
             progress=progress,
         )
-    write_poses(trajectory, out)
-    return {**report, "seconds": time.perf_counter() - started_s}, trajectory
+    write_poses(found.trajectory, out)
+    return {**report, "seconds": time.perf_counter() - started_s}, found.trajectory
 
 
 def refine_poses_remotely(
@@ -109,6 +109,12 @@ def refine_poses_remotely(
         "focal_scale": _told(answer, "focal_scale"),
         "focal_scale_sigma": _told(answer, "focal_scale_sigma"),
         "focal_is_applied": answer.focal_is_applied,
+        "principal_x_shift_px": _told(answer, "principal_x_shift_px"),
+        "principal_x_sigma_px": _told(answer, "principal_x_sigma_px"),
+        "principal_x_is_applied": answer.principal_x_is_applied,
+        "principal_y_shift_px": _told(answer, "principal_y_shift_px"),
+        "principal_y_sigma_px": _told(answer, "principal_y_sigma_px"),
+        "principal_y_is_applied": answer.principal_y_is_applied,
         "problems": list(answer.problems),
         "seconds": time.perf_counter() - started_s,
     }
