@@ -19,7 +19,7 @@ from roel_service.progress import ProgressCallback, ignore, part_of
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource
 from roel_service.scene.lines import LineMap
-from roel_service.scene.results import CalibrationError, IntrinsicsEstimate, PoseResult
+from roel_service.scene.results import CalibrationOffset, IntrinsicsEstimate, PoseResult
 from roel_service.scene.trajectory import Trajectory
 from roel_service.store.refinements import RefinedPoses
 from roel_service.wire.nouns import trajectory_to_proto
@@ -128,9 +128,9 @@ def _calibration(found: IntrinsicsEstimate | None) -> dict[str, Any]:
     }
 
 
-def _sigma(error: CalibrationError | None) -> float | None:
+def _sigma(error: CalibrationOffset | None) -> float | None:
     return None if error is None or not np.isfinite(error.sigma) else error.sigma
 
 
-def _is_applied(error: CalibrationError | None) -> bool:
+def _is_applied(error: CalibrationOffset | None) -> bool:
     return error is not None and error.is_applied

@@ -19,14 +19,13 @@ import numpy as np
 
 from roel_service.arrays import FloatArray
 from roel_service.scene.camera import Camera
-from roel_service.scene.results import CalibrationError, IntrinsicsEstimate
+from roel_service.scene.results import CalibrationOffset, IntrinsicsEstimate
 
 # Steps between calibrations, as shares of the focal length, and how many on either side of the least
 # cost are needed.
 STEP, SIDE_COUNT = 0.01, 2
 # A number that is given is at most so many steps off.
 MAX_STEP_COUNT = 6
-MAX_COST_COUNT = 2 * MAX_STEP_COUNT + 1
 # All numbers are looked for so many times at the most.
 MAX_PASS_COUNT = 3
 # What is left with any number of observations, as a share: the costs' own errors are not all of chance.
@@ -102,14 +101,14 @@ PRINCIPAL_Y = _Number(
 
 def _mended(
     given: Camera, camera: Camera, number: _Number, cost: Callable[[Camera], float]
-) -> tuple[CalibrationError, Camera]:
+) -> tuple[CalibrationOffset, Camera]:
     """What is wrong with one number of the given camera, and a mended camera without that."""
     unit = number.unit(camera)
     share, sigma = least_cost(lambda share: cost(number.changed(camera, share * unit)))
     likeliest = number.changed(camera, share * unit)
     least = max(LEAST_CHANGE, SIGMA_COUNT * sigma) if camera == given else SIGMA_COUNT_THEN * sigma
     camera = likeliest if abs(share) > least else camera
-    error = CalibrationError(
+    error = CalibrationOffset(
         change=number.between(given, likeliest),
         sigma=sigma * unit,
         is_applied=number.between(given, camera) != 0.0,

@@ -156,7 +156,7 @@ class PoseProblem(Enum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CalibrationError:
+class CalibrationOffset:
     """How far off one number of a calibration is.
 
     Attributes:
@@ -180,9 +180,9 @@ class IntrinsicsEstimate:
         camera: the given calibration with what is applied.
     """
 
-    focal: CalibrationError
-    principal_x: CalibrationError
-    principal_y: CalibrationError
+    focal: CalibrationOffset
+    principal_x: CalibrationOffset
+    principal_y: CalibrationOffset
     camera: Camera
 
 

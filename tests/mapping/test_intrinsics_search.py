@@ -3,8 +3,8 @@ import pytest
 
 from roel_service.mapping.intrinsics_search import (
     LEAST_SIGMA,
-    MAX_COST_COUNT,
     MAX_PASS_COUNT,
+    MAX_STEP_COUNT,
     STEP,
     estimate_intrinsics,
     least_cost,
@@ -15,6 +15,7 @@ from roel_service.mapping.intrinsics_search import (
 
 from .synthetic import CAMERA
 
+MAX_COST_COUNT = 2 * MAX_STEP_COUNT + 1
 NUMBERS = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
