@@ -554,6 +554,8 @@ class AsyncClient:
     ) -> AsyncIterator[AsyncTracking]:
         """A camera that is followed in a map, events up and poses down.
 
+        It begins once the server is ready for the events, at once or after a few seconds.
+
         Args:
             map_version: name of the version that holds the place.
             camera: calibration of the sensor.
@@ -564,6 +566,7 @@ class AsyncClient:
         setup = tracking_setup(map_version, camera, T_world_camera, t_us, config)
         async with self._connection.exchange(self._localization.TrackPoses) as exchange:
             await exchange.send(localization_pb2.TrackPosesRequest(setup=setup))
+            await exchange.heard()
             yield AsyncTracking(exchange)
 
     def operation(self, name: str) -> AsyncOperation:

@@ -541,6 +541,8 @@ class Client:
     ) -> Iterator[Tracking]:
         """A camera that is followed in a map, events up and poses down.
 
+        It begins once the server is ready for the events, at once or after a few seconds.
+
         Args:
             map_version: name of the version that holds the place.
             camera: calibration of the sensor.
@@ -551,6 +553,7 @@ class Client:
         setup = tracking_setup(map_version, camera, T_world_camera, t_us, config)
         with self._connection.exchange(self._localization.TrackPoses) as exchange:
             exchange.send(localization_pb2.TrackPosesRequest(setup=setup))
+            exchange.heard()
             yield Tracking(exchange)
 
     def operation(self, name: str) -> Operation:

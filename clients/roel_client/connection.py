@@ -197,6 +197,11 @@ class AsyncExchange:
         with self._endpoint.errors():
             await _written(self._call, message)
 
+    async def heard(self) -> None:
+        """Wait until the other side listens, or has ended the call, which `receive` tells."""
+        with self._endpoint.errors():
+            await self._call.initial_metadata()
+
     async def finish(self) -> None:
         """Say that nothing follows."""
         with self._endpoint.errors():
@@ -292,6 +297,11 @@ class Exchange:
     def send(self, message: Any) -> None:
         """Say something; whether the call has ended is told by `receive`."""
         self._messages.put(message)
+
+    def heard(self) -> None:
+        """Wait until the other side listens, or has ended the call, which `receive` tells."""
+        with self._endpoint.errors():
+            self._call.initial_metadata()
 
     def finish(self) -> None:
         """Say that nothing follows."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from roel_service.jobs.inputs import CachePlace
+from roel_service.jobs.cache_place import CachePlace
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from roel_service.errors import InputError, RoelError
+from roel_service.jobs.asked import Questions, questions_of
 from roel_service.jobs.batch_inputs import BatchParameters
 from roel_service.jobs.desk import Desk
 from roel_service.jobs.faults import logged_fault
-from roel_service.jobs.questions import Question, Questions, questions_of
+from roel_service.jobs.questions import Question
 from roel_service.jobs.task import Tell
 from roel_service.progress import Progress
 from roel_service.store.batches import AnsweredBatch

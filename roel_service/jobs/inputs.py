@@ -9,6 +9,7 @@ from pathlib import Path
 
 from roel_service.config.stages import Config
 from roel_service.errors import StateError
+from roel_service.jobs.cache_place import CachePlace
 from roel_service.scene.camera import Camera
 from roel_service.scene.events import EventSource, EventStream
 from roel_service.scene.trajectory import Trajectory
@@ -17,14 +18,6 @@ from roel_service.store.records import EventStreamRecord
 from roel_service.v1 import types_pb2
 from roel_service.wire.chunks import decode_chunk
 from roel_service.wire.nouns import trajectory_from_proto
-
-
-@dataclass(frozen=True, kw_only=True)
-class CachePlace:
-    """Where results of stages are kept, and how much of them."""
-
-    folder: Path
-    max_bytes: int
 
 
 @dataclass(frozen=True, kw_only=True)

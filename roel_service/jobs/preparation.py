@@ -7,13 +7,10 @@ from typing import Any, NamedTuple
 
 from roel_service.config.stages import Config
 from roel_service.jobs.batch_inputs import BatchParameters
+from roel_service.jobs.cache_place import CachePlace
 from roel_service.jobs.event_imports import EventImportParameters
 from roel_service.jobs.imports import ImportParameters
-from roel_service.jobs.inputs import (
-    CachePlace,
-    FollowParameters,
-    sealed_parameters,
-)
+from roel_service.jobs.inputs import FollowParameters, sealed_parameters
 from roel_service.jobs.questions import MapFile
 from roel_service.jobs.refine_inputs import RefineParameters
 from roel_service.store.garbage import LONGEST_UPLOAD_S

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from roel_service.jobs.inputs import CachePlace
+from roel_service.jobs.cache_place import CachePlace
 from roel_service.jobs.stage_files import StageFiles
 from roel_service.mapping.stage_cache import Arrays
 

@@ -45,7 +45,7 @@ class Child:
     """One process, and a thread that listens to it.
 
     Args:
-        preload: module that its tasks will need; it is imported before the first one arrives.
+        preload: entry point that its tasks will name; it is ready before the first one arrives.
     """
 
     def __init__(self, preload: str = "") -> None:

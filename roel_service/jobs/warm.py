@@ -21,7 +21,7 @@ class WarmExecutor:
     Args:
         capacity: children.
         queued_count: calls that may wait for one.
-        preload: module that the calls need; imported before the first call.
+        preload: entry point that the calls name; ready before the first one.
     """
 
     def __init__(self, capacity: int, queued_count: int, preload: str = "") -> None:

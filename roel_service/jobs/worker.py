@@ -42,7 +42,7 @@ def serve(pipe: Connection, preload: str) -> None:
 
     Args:
         pipe: tasks come in, messages go out; closed by the front.
-        preload: module that the tasks will need, or nothing.
+        preload: entry point that the tasks will name, made ready before the first of them; or nothing.
     """
     # Ctrl-C reaches the whole process group; the front alone decides what it means. SIGTERM keeps
     # its default action, because a Python handler would wait for native code to return.
@@ -52,9 +52,9 @@ def serve(pipe: Connection, preload: str) -> None:
     os.nice(NICENESS)
     os.environ.update(dict.fromkeys(LIBRARY_THREADS, "1"))
     memory.volunteer()
-    if preload:
-        pkgutil.resolve_name(preload)
     workshop = Workshop()
+    if preload:
+        workshop.work(preload)
     while (spec := received(pipe)) is not None:
         with memory.reserving_at_most(spec.limits.memory_bytes):
             message = last_message(spec, thinned(pipe.send), workshop)

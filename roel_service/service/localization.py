@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections.abc import AsyncIterator, Awaitable, Callable
+from functools import partial
 from typing import Any
 
 from google.longrunning import operations_pb2
 
 from roel_service.errors import InputError, LimitError, RoelError
-from roel_service.jobs.questions import LocalizeQuestion, Questions, pose_prior
+from roel_service.jobs.asked import Questions, pose_prior
+from roel_service.jobs.questions import LocalizeQuestion
 from roel_service.service.asking import Asking
 from roel_service.service.batches import Batching
 from roel_service.service.following import Following
@@ -70,7 +72,8 @@ class LocalizationServicer:
             raise InputError("stream", "a message that says where the camera is", "none")
         setup = request_part(request, "setup")
         begins = await asyncio.to_thread(self._questions.tracking, setup)
-        async for pose in self._following.poses(begins, requests):
+        listens = partial(context.send_initial_metadata, ())
+        async for pose in self._following.poses(begins, requests, listens):
             yield pose
 
     async def _setup(

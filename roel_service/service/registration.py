@@ -7,7 +7,7 @@ from typing import Any
 
 from google.longrunning import operations_pb2
 
-from roel_service.jobs.questions import Questions
+from roel_service.jobs.asked import Questions
 from roel_service.service.asking import Asking
 from roel_service.service.batches import Batching
 from roel_service.v1 import registration_pb2

@@ -6,8 +6,8 @@ from typing import Any
 
 from google.longrunning import operations_pb2, operations_pb2_grpc
 
+from roel_service.jobs.asked import Questions
 from roel_service.jobs.preparation import cache_place
-from roel_service.jobs.questions import Questions
 from roel_service.jobs.scheduler import Scheduler
 from roel_service.service.asking import Asking
 from roel_service.service.batches import Batching

@@ -13,33 +13,61 @@ import numpy as np
 from roel_service.arrays import FloatArray
 from roel_service.config.stages import TrackConfig
 from roel_service.tracking.fit import Window, WindowFit, fit_window
+from roel_service.tracking.follower import RIVAL_SHARE, Follower
 from roel_service.tracking.locate import EVENT_SCALES_PX, is_same_pose, roughly_at
 from roel_service.tracking.motion import MotionState
 from roel_service.tracking.sight import Eyes
+from roel_service.tracking.verdict import is_possible
 
 # A start is between so many deviations away from the pose, to the reach at the most.
 LEAST_SIGMA_COUNT, MOST_SIGMA_COUNT = 10.0, 40.0
 # Scales of the rounds, px, and how many events are enough for them.
 SCALES_PX = (8.0, 4.0, 2.0, 1.0)
-EVENT_COUNT = 4_000
+EVENT_COUNT = 2_500
 
 
-def challengers(
-    state: MotionState, window: Window, eyes: Eyes, config: TrackConfig, rng: np.random.Generator
-) -> list[WindowFit]:
-    """Another answer for a window, or none where the fit comes back.
+class Challenge:
+    """Another answer for a window, looked for while the one that is challenged is followed further.
 
     Args:
-        state: the answer that is challenged.
+        follower: the answer, with the window's fit.
         rng: draws where the fit starts.
     """
-    place = state.T_world_camera.retract(_far_off(state, config, rng))
-    start = roughly_at(place, state.velocity, window.t_us, config)
-    few = window.thinned(EVENT_COUNT)
-    rough = fit_window(start, few, eyes.pieces, eyes.view, config, SCALES_PX)
-    if is_same_pose(rough.state, state):
-        return []
-    return [fit_window(rough.state, window, eyes.pieces, eyes.view, config, EVENT_SCALES_PX)]
+
+    def __init__(
+        self,
+        follower: Follower,
+        window: Window,
+        eyes: Eyes,
+        config: TrackConfig,
+        rng: np.random.Generator,
+    ) -> None:
+        # The follower goes on meanwhile.
+        self._fit, self._before = follower.fit, follower.before
+        self._window, self._eyes, self._config = window, eyes, config
+        place = follower.state.T_world_camera.retract(_far_off(follower.state, config, rng))
+        self._start = roughly_at(place, follower.state.velocity, window.t_us, config)
+
+    def others(self) -> list[Follower]:
+        """A rival, as if it had been followed so far, or none."""
+        return [Follower(fit, self._before) for fit in self._fits() if self._is_rival(fit)]
+
+    def _fits(self) -> list[WindowFit]:
+        """Where the fit ends, unless it comes back."""
+        pieces, view = self._eyes.pieces, self._eyes.view
+        few = self._window.thinned(EVENT_COUNT)
+        rough = fit_window(self._start, few, pieces, view, self._config, SCALES_PX)
+        if is_same_pose(rough.state, self._fit.state):
+            return []
+        return [fit_window(rough.state, self._window, pieces, view, self._config, EVENT_SCALES_PX)]
+
+    def _is_rival(self, fit: WindowFit) -> bool:
+        least_count = RIVAL_SHARE * self._fit.evidence.explained_count
+        return (
+            is_possible(fit, self._config)
+            and fit.evidence.explained_count >= least_count
+            and not is_same_pose(fit.state, self._fit.state)
+        )
 
 
 def _far_off(state: MotionState, config: TrackConfig, rng: np.random.Generator) -> FloatArray:

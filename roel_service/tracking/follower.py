@@ -60,10 +60,6 @@ class Follower:
         explained_count = self.fit.evidence.explained_count
         return self.explained_count / explained_count if explained_count else 1.0
 
-    def instead(self, fit: WindowFit) -> Follower:
-        """Another answer for the last window, as if it had been followed so far."""
-        return Follower(fit, self.before)
-
     def begin_anew(self) -> None:
         """Take nothing that was said so far for a reason to rely on it."""
         self.status = PoseStatus.UNCERTAIN

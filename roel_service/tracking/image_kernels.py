@@ -17,7 +17,7 @@ SMALL_SQUARE_RAD2 = 1e-8
 MAX_BIN_COUNT = 64
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def project(
     segments: FloatArray,
     R_world_camera: FloatArray,
@@ -59,7 +59,7 @@ def project(
     return images, depths_m
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _inside(
     x0: float, y0: float, x1: float, y1: float, right: float, bottom: float
 ) -> tuple[float, float]:
@@ -81,7 +81,7 @@ def _inside(
     return first, last
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def draw_nearest(images: FloatArray, reach_px: float, width: int, height: int) -> Array:
     """(H, W) int32: the piece nearest to each pixel, of those within `reach_px`.
 
@@ -115,7 +115,7 @@ def draw_nearest(images: FloatArray, reach_px: float, width: int, height: int) -
     return nearest
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def retracted(
     R_world_camera: FloatArray, centre: FloatArray, steps: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -145,26 +145,27 @@ def retracted(
     return rotations, centres
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def pieces_near(
-    xy_px: FloatArray, slot: IntArray, homographies: FloatArray, nearest: Array
+    xy_px: FloatArray, slot: IntArray, turns: FloatArray, K: FloatArray, nearest: Array
 ) -> Array:
     """(K,) int32: the piece near each event, once the turn since its slot is undone.
 
     Args:
         xy_px: (K, 2) ideal pixels at the events' own times.
         slot: (K,) of each event.
-        homographies: (S, 3, 3) ideal pixel at the slot -> ideal pixel of the picture.
+        turns: (S, 3, 3) rotations from the camera at the slot to that of the picture.
         nearest: (H, W) of `draw_nearest`.
     """
     height, width = nearest.shape
     piece = np.empty(len(xy_px), np.int32)
     for k in range(len(xy_px)):
-        h = homographies[slot[k]]
-        x, y = xy_px[k, 0], xy_px[k, 1]
-        w = h[2, 0] * x + h[2, 1] * y + h[2, 2]
-        u = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / w + 0.5
-        v = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / w + 0.5
+        R = turns[slot[k]]
+        x, y = (xy_px[k, 0] - K[0, 2]) / K[0, 0], (xy_px[k, 1] - K[1, 2]) / K[1, 1]
+        depth = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+        # Rounded to whole pixels.
+        u = K[0, 0] * (R[0, 0] * x + R[0, 1] * y + R[0, 2]) / depth + K[0, 2] + 0.5
+        v = K[1, 1] * (R[1, 0] * x + R[1, 1] * y + R[1, 2]) / depth + K[1, 2] + 0.5
         # A pixel that the calibration cannot undistort is not a number, and in no picture.
         if u >= 0.0 and v >= 0.0 and u < width and v < height:
             piece[k] = nearest[int(v), int(u)]
@@ -173,7 +174,7 @@ def pieces_near(
     return piece
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def distances(
     xy_px: FloatArray,
     slot: IntArray,
@@ -230,7 +231,7 @@ def distances(
     return residual_px, jacobian
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def event_weights(
     residual_px: FloatArray,
     piece: Array,
@@ -261,7 +262,7 @@ def event_weights(
     return weight
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(
     residual_px: FloatArray, by_pose: FloatArray, after_s: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
@@ -275,19 +276,29 @@ def normal_equations(
     """
     information = np.zeros((12, 12))
     slope = np.zeros(12)
-    for k in range(len(residual_px)):
-        if weight[k] == 0.0:
-            continue
+    # Sums over events of one time, one after the other.
+    products, residuals = np.zeros((6, 6)), np.zeros(6)
+    count = len(residual_px)
+    for k in range(count):
+        if weight[k] != 0.0:
+            for row in range(6):
+                share = weight[k] * by_pose[k, row]
+                residuals[row] += share * residual_px[k]
+                for column in range(row + 1):
+                    products[row, column] += share * by_pose[k, column]
         t = after_s[k]
+        if k + 1 < count and after_s[k + 1] == t:
+            continue
         for row in range(6):
-            share = weight[k] * by_pose[k, row]
-            slope[row] += share * residual_px[k]
-            slope[row + 6] += t * share * residual_px[k]
+            slope[row] += residuals[row]
+            slope[row + 6] += t * residuals[row]
+            residuals[row] = 0.0
             for column in range(row + 1):
-                product = share * by_pose[k, column]
+                product = products[row, column]
                 information[row, column] += product
                 information[row + 6, column] += t * product
                 information[row + 6, column + 6] += t * t * product
+                products[row, column] = 0.0
     for row in range(6):
         for column in range(row):
             for i, j in ((row, column), (row + 6, column + 6)):
@@ -299,7 +310,7 @@ def normal_equations(
     return information, slope
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def information_by_edge(
     by_pose: FloatArray, after_s: FloatArray, weight: FloatArray, edge: IntArray, edge_count: int
 ) -> FloatArray:
@@ -310,23 +321,30 @@ def information_by_edge(
         edge: (K,) of each event.
         edge_count: E.
     """
-    information = np.zeros((edge_count, 12, 12))
-    row = np.empty(12)
+    # By powers of the time: 1, t and t^2.
+    sums = np.zeros((edge_count, 3, 6, 6))
     for k in range(len(weight)):
         if weight[k] == 0.0:
             continue
-        for i in range(6):
-            row[i] = by_pose[k, i]
-            row[i + 6] = after_s[k] * by_pose[k, i]
-        sums = information[edge[k]]
-        for i in range(12):
-            share = weight[k] * row[i]
-            for j in range(12):
-                sums[i, j] += share * row[j]
+        of_edge, t = sums[edge[k]], after_s[k]
+        for row in range(6):
+            share = weight[k] * by_pose[k, row]
+            for column in range(6):
+                product = share * by_pose[k, column]
+                of_edge[0, row, column] += product
+                of_edge[1, row, column] += t * product
+                of_edge[2, row, column] += t * t * product
+    information = np.empty((edge_count, 12, 12))
+    for row in range(6):
+        for column in range(6):
+            information[:, row, column] = sums[:, 0, row, column]
+            information[:, row + 6, column] = sums[:, 1, row, column]
+            information[:, row, column + 6] = sums[:, 1, row, column]
+            information[:, row + 6, column + 6] = sums[:, 2, row, column]
     return information
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def support(
     xy_px: FloatArray,
     piece: Array,

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from roel_service.config.stages import TrackConfig
 from roel_service.scene.results import PoseStatus
-from roel_service.tracking.challenge import challengers
+from roel_service.tracking.challenge import Challenge
 from roel_service.tracking.fit import Window, WindowFit
 from roel_service.tracking.follower import Follower, rivals
 from roel_service.tracking.locate import is_same_pose
 from roel_service.tracking.sight import Eyes
-from roel_service.tracking.verdict import is_possible
 
 
 class Pursuit:
@@ -23,20 +22,13 @@ class Pursuit:
         followers: what was found; none is a pursuit that is over.
         eyes: with which it is followed.
         config: parameters.
-        rng: draws the challenges.
 
     Attributes:
         followers: the best first.
     """
 
-    def __init__(
-        self,
-        followers: Sequence[Follower],
-        eyes: Eyes,
-        config: TrackConfig,
-        rng: np.random.Generator,
-    ) -> None:
-        self._eyes, self._config, self._rng = eyes, config, rng
+    def __init__(self, followers: Sequence[Follower], eyes: Eyes, config: TrackConfig) -> None:
+        self._eyes, self._config = eyes, config
         self.followers = rivals(followers)
 
     @property
@@ -52,12 +44,20 @@ class Pursuit:
         best, *others = self.followers
         return PoseStatus.UNCERTAIN if others else best.status
 
-    def follow(self, window: Window) -> WindowFit:
-        """Go on to the next window, and tell what it says of the best answer, though it be lost."""
+    def follow(self, window: Window, others: Callable[[], Sequence[Follower]] = tuple) -> WindowFit:
+        """Go on to the next window, and tell what it says of the best answer, though it be lost.
+
+        Args:
+            others: waits for what the challenge of the last window has found; it is followed, too.
+        """
         for follower in self.followers:
             follower.follow(window, self._eyes, self._config)
-        best = max(self.followers, key=lambda each: each.explained_count)
-        alive = [each for each in self.followers if each.status is not PoseStatus.LOST]
+        late = others()
+        for follower in late:
+            follower.follow(window, self._eyes, self._config)
+        followers = [*self.followers, *late]
+        best = max(followers, key=lambda each: each.explained_count)
+        alive = [each for each in followers if each.status is not PoseStatus.LOST]
         self.followers = rivals(alive)
         return best.fit
 
@@ -70,14 +70,13 @@ class Pursuit:
         ]
         self.followers = rivals([*self.followers, *new])
 
-    def challengers(self, window: Window) -> list[Follower]:
-        """Other answers for the last window, where only one is left; they are not joined yet.
+    def challenge(self, window: Window, rng: np.random.Generator) -> Challenge | None:
+        """What may find another answer for the last window, where only one is left.
 
         Args:
             window: the last one.
+            rng: draws where it begins.
         """
         if len(self.followers) != 1 or self.followers[0].fit.evidence.is_still:
-            return []
-        follower = self.followers[0]
-        fits = challengers(follower.state, window, self._eyes, self._config, self._rng)
-        return [follower.instead(fit) for fit in fits if is_possible(fit, self._config)]
+            return None
+        return Challenge(self.followers[0], window, self._eyes, self._config, rng)

@@ -26,7 +26,7 @@ from roel_service.tracking.verdict import is_possible
 # the same events give the same poses.
 SLICE_MS = 30.0
 # What a fit in one of the windows that came meanwhile takes, of about so many events.
-FIT_MS, EVENT_COUNT = 7.5, 3_000
+FIT_MS, EVENT_COUNT = 5.0, 3_000
 
 
 class Search:
@@ -92,7 +92,7 @@ class Search:
         sight = yield from looking(around, window.t_us, eyes, turn_rate)
         fits = yield from locating(place, sight, window, eyes, config, rng)
         answers = [Follower(fit, before) for fit in fits if is_possible(fit, config)]
-        pursuit = Pursuit(answers, eyes, config, rng)
+        pursuit = Pursuit(answers, eyes, config)
         while self._waiting and not pursuit.is_over:
             # Two, since one comes meanwhile.
             yield 2.0 * FIT_MS * len(pursuit.followers)

@@ -63,7 +63,7 @@ class Eyes:
 
 
 # What the two steps of a sharp look take at 640x480, about.
-SEEDS_MS, PLANES_MS = 19.0, 18.0
+SEEDS_MS, PLANES_MS = 22.0, 20.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

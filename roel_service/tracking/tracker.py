@@ -82,11 +82,11 @@ class PoseTracker:
         # Events in the order of time, in pieces as they came.
         self._recent: list[EventStream] = []
         self._next_us = 0
-        self._pursuit = Pursuit([], self._eyes, config, self._rng)
+        self._pursuit = Pursuit([], self._eyes, config)
         # The first one goes on, in a slice that has begun.
         self._searches: list[Search] = []
         self._slices: list[Future[None]] = []
-        self._challenges: list[Future[list[Follower]]] = []
+        self._challenge: Future[list[Follower]] | None = None
         # Windows since the camera was lost, and since it was known well.
         self._lost_count = self._unsure_count = 0
         self._whereabouts = Whereabouts(guess, self._eyes.pieces.extent_m)
@@ -171,23 +171,21 @@ class PoseTracker:
             self._watched(window, around)
         else:
             fit = self._followed(window, around)
-        if not self._slices:
-            # A search is a challenge itself.
-            self._challenges = [self._beside.submit(self._pursuit.challengers, window)]
+        # A search is a challenge itself.
+        if not self._slices and (challenge := self._pursuit.challenge(window, self._rng)):
+            self._challenge = self._beside.submit(challenge.others)
         if not self._is_live:
             self._gather(finish=True)
         return _told(window, self._pursuit, fit)
 
     def _gather(self, *, finish: bool = False) -> None:
-        """What was done beside: the challenge, and the slice of the search, or all of it.
+        """The slice of the search that was done beside, or all of it.
 
         What a search has found is taken up once it is up to date; then the others are idle.
         """
-        for challenge in self._challenges:
-            self._pursuit.join(challenge.result())
         for each in self._slices:
             each.result()
-        self._challenges, self._slices = [], []
+        self._slices = []
         if finish:
             for search in self._searches:
                 search.finish()
@@ -200,7 +198,8 @@ class PoseTracker:
 
     def _followed(self, window: Window, around: EventStream) -> WindowFit:
         """Go on with what is known: the best answer's fit, though it be lost by it."""
-        fit = self._pursuit.follow(window)
+        challenge, self._challenge = self._challenge, None
+        fit = self._pursuit.follow(window, tuple if challenge is None else challenge.result)
         if self._pursuit.is_over:
             self._lost_count = self._unsure_count = 0
             return fit
@@ -241,8 +240,8 @@ class PoseTracker:
         )
 
     def _lose(self) -> None:
-        self._pursuit = Pursuit([], self._eyes, self._config, self._rng)
-        self._searches, self._challenges = [], []
+        self._pursuit = Pursuit([], self._eyes, self._config)
+        self._searches, self._challenge = [], None
         self._lost_count = self._unsure_count = 0
 
 

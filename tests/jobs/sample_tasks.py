@@ -164,3 +164,13 @@ class Tally:
     def __call__(self, parameters, tell):
         self.told.append(parameters)
         return list(self.told)
+
+
+class Prepared:
+    """Leaves a sign in its process once it is made."""
+
+    def __init__(self):
+        os.environ["PREPARED"] = "yes"
+
+    def __call__(self, parameters, tell):
+        return None

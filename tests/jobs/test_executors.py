@@ -15,8 +15,8 @@ from roel_service.progress import Progress
 MIB = 2**20
 
 
-def warm(capacity):
-    executor = WarmExecutor(capacity, queued_count=8, preload="sample_tasks")
+def warm(capacity, preload="sample_tasks"):
+    executor = WarmExecutor(capacity, queued_count=8, preload=preload)
     executor.start()
     return executor
 
@@ -124,6 +124,16 @@ class TestContract:
             return await executor.run(spec("double", 2), ignore)
 
         assert using(make, scenario) == 4
+
+
+def test_a_warm_child_makes_its_object_before_the_first_task():
+    def prepared(capacity):
+        return warm(capacity, preload="sample_tasks:Prepared")
+
+    (_, sign), _ = heard(prepared, "tell_environment", "PREPARED")
+    assert sign == "yes"
+    (_, sign), _ = heard(warm, "tell_environment", "PREPARED")
+    assert sign is None
 
 
 @pytest.mark.parametrize("make", [ProcessExecutor, warm])

@@ -3,7 +3,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from roel_service.jobs.inputs import CachePlace
+from roel_service.jobs.cache_place import CachePlace
 from roel_service.jobs.preparations import Origin, Preparations
 
 

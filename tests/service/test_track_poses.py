@@ -1,5 +1,7 @@
 """A camera that a server follows: the same poses as in process, and what ends a call."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -67,17 +69,28 @@ def version(client, file):
 
 
 @pytest.fixture
-def followed(server):
-    """Sends messages of a whole call, and gives its answers."""
-    connection = Connection(Endpoint(address=server.address))
+def connection(server):
+    connected = Connection(Endpoint(address=server.address))
+    yield connected
+    connected.close()
+
+
+@pytest.fixture
+def answers_of(connection):
+    """Sends messages of a whole call; its answers, as they come."""
 
     def called(*requests):
         stub = localization_pb2_grpc.LocalizationServiceStub(connection.channel)
         messages = [localization_pb2.TrackPosesRequest(**request) for request in requests]
-        return list(connection.stream(stub.TrackPoses, iter(messages)))
+        return connection.stream(stub.TrackPoses, iter(messages))
 
-    yield called
-    connection.close()
+    return called
+
+
+@pytest.fixture
+def followed(answers_of):
+    """Sends messages of a whole call; its answers once it has ended."""
+    return lambda *requests: list(answers_of(*requests))
 
 
 def setup(version, first, camera=CAMERA):
@@ -126,6 +139,40 @@ def test_a_call_that_is_left_makes_room_for_the_next(client, version, room, firs
     with client.tracking(version, CAMERA, first, config=CONFIG) as tracking:
         tracking.finish()
         assert tracking.receive() is None
+
+
+def test_a_caller_is_told_when_events_are_waited_for(connection, version, first):
+    request = localization_pb2.TrackPosesRequest(**setup(version, first))
+    said, is_told = threading.Event(), threading.Event()
+
+    def requests():
+        yield request
+        said.set()
+        # None of the events is there yet.
+        is_told.wait(60)
+
+    stub = localization_pb2_grpc.LocalizationServiceStub(connection.channel)
+    call = stub.TrackPoses(requests(), timeout=60)
+    assert said.wait(60)
+    call.initial_metadata()
+    assert call.is_active()
+    is_told.set()
+    assert list(call) == []
+
+
+def test_poses_of_sound_chunks_come_before_the_error_of_a_broken_one(
+    answers_of, version, room, first
+):
+    chunks = room.chunks()
+    broken = {"chunk": events_pb2.EventChunk(seq=4, data=b"no events")}
+    answers = answers_of(
+        setup(version, first), *(chunk(seq, part) for seq, part in enumerate(chunks[:4])), broken
+    )
+    poses = []
+    with pytest.raises(EventsError) as caught:
+        poses.extend(answers)
+    assert caught.value.reason == "CHUNK_MALFORMED"
+    assert poses[-1].seq == 3
 
 
 def test_a_guess_is_where_the_search_begins(followed, version, room, first):

@@ -1,10 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from roel_service.config.stages import TrackConfig
 from roel_service.scene.lines import LineMap
-from roel_service.tracking.challenge import challengers
+from roel_service.tracking.challenge import Challenge
 from roel_service.tracking.fit import fit_window
+from roel_service.tracking.follower import Follower
 from roel_service.tracking.locate import EVENT_SCALES_PX, roughly_at
 
 from .synthetic import events_of, eyes_on, motion, recording, window_at
@@ -19,13 +22,13 @@ def fitted(pose, window, eyes):
     return fit_window(start, window, eyes.pieces, eyes.view, CONFIG, EVENT_SCALES_PX)
 
 
-def found(state, window, eyes):
-    """What several challenges end in, without those that come back."""
-    return [
-        fit
-        for seed in SEEDS
-        for fit in challengers(state, window, eyes, CONFIG, np.random.default_rng(seed))
+def found(fit, window, eyes):
+    """What several challenges of a fit end in, without those that come back."""
+    follower = Follower(fit)
+    challenges = [
+        Challenge(follower, window, eyes, CONFIG, np.random.default_rng(seed)) for seed in SEEDS
     ]
+    return [other.fit for challenge in challenges for other in challenge.others()]
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +38,7 @@ def room():
 
 def test_from_the_right_place_every_challenge_comes_back(room):
     eyes, window = eyes_on(room.line_map), window_at(T_US, room.events)
-    assert found(fitted(room.pose(T_US), window, eyes).state, window, eyes) == []
+    assert found(fitted(room.pose(T_US), window, eyes), window, eyes) == []
 
 
 def test_beside_a_wrong_place_a_challenge_finds_what_explains_more(room):
@@ -45,7 +48,7 @@ def test_beside_a_wrong_place_a_challenge_finds_what_explains_more(room):
     assert (
         np.linalg.norm(wrong.state.T_world_camera.translation - room.pose(T_US).translation) > 0.05
     )
-    most = max(fit.evidence.explained_count for fit in found(wrong.state, window, eyes))
+    most = max(fit.evidence.explained_count for fit in found(wrong, window, eyes))
     assert most > 1.5 * wrong.evidence.explained_count
 
 
@@ -58,8 +61,8 @@ def test_along_upright_bars_another_answer_explains_about_as_much():
     events = events_of(bars, t_us, poses, np.random.default_rng(1))
     eyes, window = eyes_on(LineMap.from_segments(bars)), window_at(T_US, events)
     right = fitted(poses[20], window, eyes)
-    unsure = right.state.stepped(np.zeros(12), 100.0 * right.state.covariance)
-    others = found(unsure, window, eyes)
+    wide = right.state.stepped(np.zeros(12), 100.0 * right.state.covariance)
+    others = found(replace(right, state=wide), window, eyes)
     assert max(fit.evidence.explained_count for fit in others) > (
         0.9 * right.evidence.explained_count
     )
