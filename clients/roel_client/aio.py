@@ -795,7 +795,8 @@ class AsyncPictureStream:
 class AsyncTracking:
     """Events of a camera on their way; sending and receiving may be two tasks.
 
-    A server reads no further than it has got with its work: `send` waits then.
+    A server reads a few messages further than it has got with its work; what is sent faster waits
+    here.
     """
 
     def __init__(self, exchange: AsyncExchange) -> None:

@@ -20,6 +20,7 @@ from roel_service.jobs.task import (
     Message,
     OnNews,
     Partial,
+    Ready,
     TaskSpec,
     Usage,
 )
@@ -50,6 +51,7 @@ class Child:
 
     def __init__(self, preload: str = "") -> None:
         self._messages: asyncio.Queue[Message | None] = asyncio.Queue()
+        self._ready = asyncio.Event()
         self._ended = asyncio.Event()
         self._pipe, child_end = _CONTEXT.Pipe()
         self._process = _CONTEXT.Process(target=worker.serve, args=(child_end, preload))
@@ -80,6 +82,8 @@ class Child:
             LimitError: TASK_OUT_OF_MEMORY, TASK_TIME_LIMIT.
             UnavailableError: WORKER_LOST, the child was killed.
         """
+        # What it loads before its first task, or compiles on a new machine, is in no caller's time.
+        await self._ready.wait()
         self._is_sound = False
         self._peak_bytes = 0
         # A child that is gone is noticed by the thread that listens.
@@ -149,8 +153,12 @@ class Child:
     def _listen(self, loop: asyncio.AbstractEventLoop) -> None:
         with self._pipe:
             while (message := worker.received(self._pipe)) is not None:
-                loop.call_soon_threadsafe(self._messages.put_nowait, message)
+                if isinstance(message, Ready):
+                    loop.call_soon_threadsafe(self._ready.set)
+                else:
+                    loop.call_soon_threadsafe(self._messages.put_nowait, message)
         self._process.join()
+        loop.call_soon_threadsafe(self._ready.set)
         loop.call_soon_threadsafe(self._messages.put_nowait, None)
         loop.call_soon_threadsafe(self._ended.set)
 

@@ -47,6 +47,11 @@ class Partial:
     result: Any
 
 
+@dataclass(frozen=True)
+class Ready:
+    """A child waits for its first task."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Usage:
     """What an attempt has used so far."""

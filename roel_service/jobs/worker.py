@@ -16,7 +16,7 @@ from typing import Any
 from roel_service.errors import LimitError, RoelError
 from roel_service.jobs import memory
 from roel_service.jobs.faults import fingerprint_of
-from roel_service.jobs.task import Done, Failed, Limits, Message, Partial, TaskSpec, Tell
+from roel_service.jobs.task import Done, Failed, Limits, Message, Partial, Ready, TaskSpec, Tell
 from roel_service.progress import Progress
 
 # A stage that just began is told at once; within a stage this often is enough for a reader.
@@ -55,6 +55,7 @@ def serve(pipe: Connection, preload: str) -> None:
     workshop = Workshop()
     if preload:
         workshop.work(preload)
+    pipe.send(Ready())
     while (spec := received(pipe)) is not None:
         with memory.reserving_at_most(spec.limits.memory_bytes):
             message = last_message(spec, thinned(pipe.send), workshop)

@@ -61,15 +61,16 @@ class Following:
             LimitError: QUEUE_FULL, TASK_OUT_OF_MEMORY, TASK_TIME_LIMIT.
             UnavailableError: WORKER_LOST; UPLOAD_IDLE.
         """
-        async with self._child() as child, self._reading(requests) as ahead:
+        async with self._child() as child:
             await self._said(child, begins)
             await listens()
-            async for sayings in ahead.sayings():
-                told: Told = await self._said(child, sayings)
-                for pose in told.poses:
-                    yield localization_pb2.TrackPosesResponse.FromString(pose)
-                if told.error is not None:
-                    raise told.error
+            async with self._reading(requests) as ahead:
+                async for sayings in ahead.sayings():
+                    told: Told = await self._said(child, sayings)
+                    for pose in told.poses:
+                        yield localization_pb2.TrackPosesResponse.FromString(pose)
+                    if told.error is not None:
+                        raise told.error
 
     @asynccontextmanager
     async def _reading(

@@ -84,7 +84,8 @@ class LocalizationServiceServicer:
         raise NotImplementedError('Method not implemented!')
 
     def TrackPoses(self, request_iterator, context):
-        """Events as they come; poses of the camera in a map that stays as it is.
+        """Events as they come; poses of the camera in a map that stays as it is. The headers of the answer
+        come once events are waited for.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

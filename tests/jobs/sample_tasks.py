@@ -174,3 +174,13 @@ class Prepared:
 
     def __call__(self, parameters, tell):
         return None
+
+
+class SlowToMake:
+    """Takes a while before its first task."""
+
+    def __init__(self):
+        time.sleep(0.6)
+
+    def __call__(self, parameters, tell):
+        return os.getpid()

@@ -136,6 +136,30 @@ def test_a_warm_child_makes_its_object_before_the_first_task():
     assert sign is None
 
 
+def slow_to_make(capacity):
+    return warm(capacity, preload="sample_tasks:SlowToMake")
+
+
+def test_what_a_child_loads_is_in_no_callers_time():
+    async def scenario(executor):
+        return await executor.run(spec("SlowToMake", time_s=0.3), ignore)
+
+    assert using(slow_to_make, scenario) > 0
+
+
+def test_a_caller_who_leaves_a_child_that_still_loads_leaves_it_to_the_next():
+    async def scenario(executor):
+        async with executor.held(2**40) as loading:
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(loading.run(spec("SlowToMake"), ignore), 0.1)
+        async with executor.held(2**40) as next_one:
+            return loading is next_one, await next_one.run(spec("SlowToMake"), ignore)
+
+    is_same, pid = using(slow_to_make, scenario)
+    assert is_same
+    assert pid != os.getpid()
+
+
 @pytest.mark.parametrize("make", [ProcessExecutor, warm])
 class TestChildren:
     def test_work_runs_in_another_process_with_one_thread_for_each_library(self, make):
