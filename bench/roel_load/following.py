@@ -47,27 +47,32 @@ class Recording:
 
 
 class Live:
-    """Events at the speed at which they were made, or at a share of it."""
+    """Events at the speed at which they were made, or at a share of it.
 
-    def __init__(self, source: EventSource, speed: float) -> None:
+    Attributes:
+        began_s: when the first event happened, by `time.monotonic`; known once it has.
+    """
+
+    def __init__(self, source: EventSource, speed: float, packet_us: int = PACKET_US) -> None:
         self._speed = speed
-        self._packets = list(_packets(source))
+        self._packets = list(_packets(source, packet_us))
+        self.began_s = 0.0
         self.width, self.height = source.width, source.height
         self.time_range_us = source.time_range_us
 
     def chunks(self) -> Iterator[EventStream]:
         """Packets, each when its last event has happened."""
-        began_s = time.monotonic()
+        self.began_s = time.monotonic()
         first_us = int(self._packets[0].t_us[0])
         for packet in self._packets:
-            due_s = began_s + 1e-6 * (int(packet.t_us[-1]) - first_us) / self._speed
+            due_s = self.began_s + 1e-6 * (int(packet.t_us[-1]) - first_us) / self._speed
             time.sleep(max(0.0, due_s - time.monotonic()))
             yield packet
 
 
-def _packets(source: EventSource) -> Iterator[EventStream]:
+def _packets(source: EventSource, packet_us: int) -> Iterator[EventStream]:
     for chunk in source.chunks():
-        edges_us = np.arange(chunk.t_us[0], chunk.t_us[-1] + PACKET_US, PACKET_US)
+        edges_us = np.arange(chunk.t_us[0], chunk.t_us[-1] + packet_us, packet_us)
         rows = np.unique([*np.searchsorted(chunk.t_us, edges_us), len(chunk)])
         for start, stop in itertools.pairwise(rows):
             view = chunk.slice(int(start), int(stop), 0)

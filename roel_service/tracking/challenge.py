@@ -23,7 +23,7 @@ from roel_service.tracking.verdict import is_possible
 LEAST_SIGMA_COUNT, MOST_SIGMA_COUNT = 10.0, 40.0
 # Scales of the rounds, px, and how many events are enough for them.
 SCALES_PX = (8.0, 4.0, 2.0, 1.0)
-EVENT_COUNT = 2_500
+EVENT_COUNT = 4_000
 
 
 class Challenge:

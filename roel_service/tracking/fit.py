@@ -64,8 +64,8 @@ class Window:
     event_count: int
 
     def thinned(self, most: int) -> Window:
-        """The window with `most` of its events, or a few more."""
-        chosen = slice(0, None, max(1, len(self.slot) // most))
+        """The window with `most` of its events at the most."""
+        chosen = slice(0, None, max(1, -(-len(self.slot) // most)))
         # Side by side in memory, as loops expect them.
         return replace(self, xy_px=self.xy_px[chosen].copy(), slot=self.slot[chosen].copy())
 

@@ -49,7 +49,7 @@ UNSURE_SCALES_PX = (4.0, *EVENT_SCALES_PX)
 # What the fields of a round take, about, scores of so many poses, and fits to lines and to events.
 FIELDS_MS = 6.0
 STEP_POSE_COUNT, STEP_MS = 1_200, 6.0
-LINE_FIT_MS, EVENT_FIT_MS = 6.5, 8.0
+LINE_FIT_MS, EVENT_FIT_MS = 4.5, 6.5
 # What is not known of a pose after the search, as shares of the reach; and of the velocity.
 POSE_SIGMA_SHARE = 0.5
 SPEED_SIGMA_DEG_S, SPEED_SIGMA_M_S = 60.0, 1.0

@@ -24,9 +24,9 @@ from roel_service.tracking.verdict import is_possible
 
 # A slice is as much as takes about so long, as the steps tell beforehand: the clock has no say, so that
 # the same events give the same poses.
-SLICE_MS = 30.0
+SLICE_MS = 27.0
 # What a fit in one of the windows that came meanwhile takes, of about so many events.
-FIT_MS, EVENT_COUNT = 5.0, 3_000
+FIT_MS, EVENT_COUNT = 5.0, 6_000
 
 
 class Search:
