@@ -1,11 +1,12 @@
 """A camera that a server follows: the same poses as in process, and what ends a call."""
 
+import asyncio
 import threading
 
 import numpy as np
 import pytest
 
-from roel_client import Client
+from roel_client import AsyncClient, Client
 from roel_client.connection import Connection, Endpoint
 from roel_service.config.stages import TrackConfig
 from roel_service.errors import (
@@ -217,6 +218,28 @@ def test_a_second_camera_finds_no_child(client, followed, version, room, first):
             pass
 
 
+def test_the_asynchronous_client_is_told_the_same(server, client, version, room, first):
+    async def followed():
+        async with (
+            AsyncClient(server.address) as there,
+            there.tracking(version, CAMERA, first, config=CONFIG) as tracking,
+        ):
+            for part in room.chunks():
+                await tracking.send(part)
+            await tracking.finish()
+            poses = []
+            while (pose := await tracking.receive()) is not None:
+                poses.append((pose.t_us, pose.status))
+            return poses
+
+    with client.tracking(version, CAMERA, first, config=CONFIG) as tracking:
+        for part in room.chunks():
+            tracking.send(part)
+        tracking.finish()
+        expected = [(pose.t_us, pose.status) for pose in iter(tracking.receive, None)]
+    assert asyncio.run(followed()) == expected
+
+
 class TestRefusals:
     def test_chunks_out_of_order(self, followed, version, room, first):
         chunks = room.chunks()
@@ -242,9 +265,25 @@ class TestRefusals:
             followed(chunk(0, room.chunks()[0]))
         assert caught.value.reason == "UPLOAD_ORDER"
 
-    def test_a_version_that_is_not_there(self, followed, first):
+    def test_a_version_that_is_not_there(self, server, client, followed, first):
+        nowhere = "projects/default/maps/nowhere/versions/latest"
         with pytest.raises(NotFoundError):
-            followed(setup("projects/default/maps/nowhere/versions/latest", first))
+            followed(setup(nowhere, first))
+        with (
+            client.tracking(nowhere, CAMERA, first) as tracking,
+            pytest.raises(NotFoundError),
+        ):
+            tracking.receive()
+
+        async def received():
+            async with (
+                AsyncClient(server.address) as there,
+                there.tracking(nowhere, CAMERA, first) as tracking,
+            ):
+                await tracking.receive()
+
+        with pytest.raises(NotFoundError):
+            asyncio.run(received())
 
     def test_an_unknown_preset(self, followed, version, first):
         request = setup(version, first)
