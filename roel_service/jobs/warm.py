@@ -58,6 +58,7 @@ class WarmExecutor:
         self._admitted_count += 1
         try:
             child = await self._ready_child()
+            child.count_call()
             try:
                 yield child
             finally:
@@ -87,15 +88,15 @@ class WarmExecutor:
 
 
 class _WarmChild(Child):
-    """A child that counts its calls."""
+    """A child that counts its calls, of which one may be a whole conversation."""
 
     def __init__(self, preload: str) -> None:
         super().__init__(preload)
         self._call_count = 0
 
-    async def run(self, spec: TaskSpec, on_news: OnNews) -> Any:
+    def count_call(self) -> None:
+        """Another one begins."""
         self._call_count += 1
-        return await super().run(spec, on_news)
 
     def is_fit(self, memory_bytes: int) -> bool:
         """Whether it can take another call: sound, not too old and not too fat."""

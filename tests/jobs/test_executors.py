@@ -245,6 +245,20 @@ def test_a_warm_child_is_replaced_before_it_grows_old(monkeypatch):
     assert len(using(warm, scenario)) == 2
 
 
+def test_a_conversation_is_one_call_however_long(monkeypatch):
+    monkeypatch.setattr(warming, "MAX_CALL_COUNT", 2)
+
+    async def scenario(executor):
+        pids = set()
+        async with executor.held(2**40) as child:
+            for _ in range(5):
+                pids.add((await child.run(spec("tell_environment", "HOME"), ignore))[0])
+        pids.add((await executor.run(spec("tell_environment", "HOME"), ignore))[0])
+        return pids
+
+    assert len(using(warm, scenario)) == 1
+
+
 def test_the_first_call_starts_a_child_that_nobody_started_before():
     async def scenario(executor):
         calls = [executor.run(spec("tell_environment", "HOME"), ignore) for _ in range(2)]
