@@ -75,15 +75,7 @@ def _packets(source: EventSource, packet_us: int) -> Iterator[EventStream]:
         edges_us = np.arange(chunk.t_us[0], chunk.t_us[-1] + packet_us, packet_us)
         rows = np.unique([*np.searchsorted(chunk.t_us, edges_us), len(chunk)])
         for start, stop in itertools.pairwise(rows):
-            view = chunk.slice(int(start), int(stop), 0)
-            yield EventStream(
-                t_us=view.t_us,
-                x=view.x,
-                y=view.y,
-                polarity=view.polarity,
-                width=chunk.width,
-                height=chunk.height,
-            )
+            yield chunk.part(int(start), int(stop))
 
 
 def measure(client: Client, recording: Recording, speed: float, *, follow: bool) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from roel_service.jobs.task import Limits, News, TaskSpec
 from roel_service.service.settings import Settings
 
 ENTRYPOINT = "roel_service.jobs.desk:Desk"
-PRELOAD = ENTRYPOINT
 
 
 class Asking:

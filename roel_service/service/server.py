@@ -29,7 +29,7 @@ from roel_service.jobs.upkeep import upkeep
 from roel_service.jobs.warm import WarmExecutor
 from roel_service.service.access import Access
 from roel_service.service.admin import Probes, admin_server
-from roel_service.service.asking import PRELOAD, Asking
+from roel_service.service.asking import ENTRYPOINT, Asking
 from roel_service.service.calls import Guard, GuardInterceptor
 from roel_service.service.exports import Exporter
 from roel_service.service.following import TRACKING_ENTRYPOINT, Following
@@ -121,7 +121,7 @@ async def running(
         )
         exports = WarmExecutor(settings.concurrent_exports, settings.queued_exports)
         questions = WarmExecutor(
-            settings.interactive_workers, settings.interactive_queued, preload=PRELOAD
+            settings.interactive_workers, settings.interactive_queued, preload=ENTRYPOINT
         )
         cameras = WarmExecutor(
             settings.tracked_cameras, settings.tracked_cameras, preload=TRACKING_ENTRYPOINT

@@ -169,8 +169,8 @@ def fitted(
         scales_px: (R,) of the rounds, each with an association of its own.
     """
     step = np.zeros(12)
+    motion = forecast
     for scale_px in scales_px:
-        motion = _stepped(forecast, step)
         near = _near(motion, events, pieces, picture, scale_px)
         event_px2 = (picture.event_noise * scale_px) ** 2
         length_px = _lengths_px(near.images)

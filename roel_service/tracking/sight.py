@@ -43,6 +43,8 @@ EVEN_US = 100_000
 # Speeds of lines are known about so well; a camera turns about so fast.
 SPEED_NOISE_PX_S, TURN_SIGMA_RAD_S = 60.0, 2.0
 ROBUST_STEP_COUNT = 8
+# What the two steps of a sharp look take at 640x480, about.
+SEEDS_MS, PLANES_MS = 22.0, 20.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,10 +62,6 @@ class Eyes:
     ideal_px: Array
     view: View
     pieces: MapPieces
-
-
-# What the two steps of a sharp look take at 640x480, about.
-SEEDS_MS, PLANES_MS = 22.0, 20.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
